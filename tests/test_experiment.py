@@ -45,7 +45,6 @@ from evnlos.experiment import (
     on_sequences,
     read_records,
     retrieved,
-    run_simulated,
     run_studies,
     run_study,
     summary_table,
@@ -493,7 +492,7 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys) -> None:
 def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeypatch) -> None:
     from evnlos.data.simulations import paper
 
-    simulated = importlib.import_module("evnlos.experiment.simulated")
+    simulated = importlib.import_module("evnlos.studies")
 
     sets = simulated.simulations(simulated.Simulated(tmp_path))
     assert [len(c.glyphs.objects()) for c in sets.values()] == [39 * 26, 26, 36]
@@ -527,7 +526,7 @@ def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeyp
         seeds=(0,),
         workers=1,
     )
-    found = run_simulated(settings)
+    found = simulated.run_simulated(settings)
     assert [(r.setup, r.arm) for r in found] == [
         ("nist", "pre-trained"),
         ("comic", "pre-trained"),
@@ -535,4 +534,4 @@ def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeyp
         ("comic", "E2E"),
     ]
     assert [list(r.positions) for r in found[1:]] == [["kalam_G"]] * 3
-    assert run_simulated(settings) == []
+    assert simulated.run_simulated(settings) == []

@@ -12,8 +12,8 @@ from evnlos.demo import ROBUST, Demo, run_demo
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import Record, Study
 from evnlos.experiment.study import write_record
-from evnlos.mismatch import finding, mismatch_table, run_mismatch
 from evnlos.models import layers_of
+from evnlos.studies import finding, mismatch_table, run_mismatch
 
 CAPTURE = "camera: {name: a camera, width: 40, height: 25}\n"
 LEFT = {
@@ -82,7 +82,7 @@ def test_each_setup_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
             raise CalibrationError("no setup fits")
         keep(settings.out, settings.seed, {("E2E", "frame"): 1.0, ("EPNP", "frame"): 2.0}, [])
 
-    monkeypatch.setattr("evnlos.mismatch.run_demo", demo)
+    monkeypatch.setattr("evnlos.studies.run_demo", demo)
     found = run_mismatch(Demo(out=tmp_path / "out"), (), tmp_path / "captures", seeds=(0, 3))
     assert ran == [
         ("flat-seed0", ["flat_A", "flat_G"], 0),
@@ -104,7 +104,7 @@ def test_robust_networks_stand_beside_the_others(tmp_path, monkeypatch):
         scores = {(f"simulation only{drawn}", "frame"): 18 + gained, (f"EPNP{drawn}", "frame"): 22 + gained}
         keep(settings.out, settings.seed, {("E2E", "frame"): 20.0, **scores}, [])
 
-    monkeypatch.setattr("evnlos.mismatch.run_demo", demo)
+    monkeypatch.setattr("evnlos.studies.run_demo", demo)
     found = run_mismatch(Demo(out=tmp_path / "out", robust=True), (), tmp_path / "captures")
     table = mismatch_table(found)
     assert "| EPNP - E2E | simulation only, robust | EPNP, robust |" in table

@@ -3,6 +3,7 @@
 import json
 from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +17,21 @@ from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import SequenceOperator, ridge_by_groups
+from evnlos.inverse import (
+    EVENT_ERRORS,
+    EVENT_ERRORS_FILE,
+    AboutErrors,
+    ScoreErrors,
+    SequenceOperator,
+    event_prior,
+    ridge_by_groups,
+)
+from evnlos.machine import Step
 from evnlos.models import FrameOperator, SequenceConfig, SequenceReconstructor, UNetConfig, load_weights
+from evnlos.models.drawn import DRAWN, DrawnEvents, subsets
 from evnlos.models.sequence import PooledFrames
 from evnlos.optics import MatrixTransport
-from evnlos.scene import FontGlyphs, HandwritingGlyphs
+from evnlos.scene import FontGlyphs, HandwritingGlyphs, Target
 from evnlos.setups import RadiometricSetup, load_setup
 from evnlos.training import Training
 from evnlos.types import Plane
@@ -251,6 +262,47 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
                 torch.testing.assert_close(image.double(), expected, **near)
 
 
+def test_scores_of_drawn_targets_are_those_of_their_frames() -> None:
+    """M x + b and what is missed beside it is the score of the frames, whatever these are."""
+    torch.manual_seed(0)
+    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0), 40)
+    for name, buffer in solver.named_buffers():
+        buffer.copy_(torch.randn_like(buffer) * {"basis": 0.3, "patterns": 0.3}.get(name, 0.1))
+    solver.static.copy_(2.0 * torch.rand(len(solver.static)))
+    solver.reach.copy_(torch.tensor([[-0.06, -0.01], [0.06, 0.01]]))
+    places = torch.stack([torch.linspace(-0.05, 0.05, 5), 0.1 * torch.linspace(-0.05, 0.05, 5)], dim=1)
+    cells, frames, kept = Plane(9, 9, 0.01), torch.rand(5, 24, 36), subsets(5, 4)
+    target = torch.rand(9, 9)
+    carrier = MatrixTransport(solver.light.flatten(1), solver.sampling.canvas, (1, 40))
+    truth = SequenceOperator(carrier, cells, places.double().numpy()).drawn(target.double()).float()
+    seen, base, information = solver.foreseen(cells, places, kept)
+    found = (seen @ target.flatten()).double() + base + solver.errors(frames, truth, places, kept)
+    images = torch.cat([solver.solved(information[k : k + 1], found[k : k + 1]) for k in range(4)])
+    torch.testing.assert_close(images, solver(frames, places, kept), rtol=1e-3, atol=1e-3)
+
+
+def test_errors_of_scores_are_told_from_noise_and_drawn_again() -> None:
+    """Mean, scatter and noise of many known targets come back; noise alone shows neither mean nor scatter."""
+    draw = np.random.default_rng(0)
+    half = draw.normal(size=(30, 60))
+    information = half @ half.T
+    root = np.linalg.cholesky(information + np.eye(30))
+    mean, spread = root @ draw.normal(size=30), root @ draw.normal(size=(30, 2))
+    noise = draw.normal(size=(400, 30)) @ root.T
+    known = mean + draw.normal(size=(400, 2)) @ spread.T + 0.5 * noise
+    for given in (0.25, None):
+        errors = ScoreErrors.of(known, information, given)
+        again = errors.draw(4000, torch.Generator().manual_seed(1)).numpy()
+        expected = spread @ spread.T + 0.25 * (information + np.eye(30))
+        assert np.abs(again.mean(axis=0) - mean).max() < 0.2 * np.abs(mean).max()
+        assert np.abs(np.cov(again.T) - expected).max() < 0.15 * np.abs(expected).max()
+    alone = ScoreErrors.of(noise[:12], information, 1.0)
+    assert np.abs(alone.mean).max() < 0.1 * np.abs(mean).max()
+    assert np.square(alone.spread).sum() < 0.2 * np.square(spread).sum()
+    few = ScoreErrors.of(noise[:1], information, 0.25)
+    assert few.spread.shape == (30, 0) and not few.mean.any() and np.allclose(few.noise, 0.5 * root)
+
+
 def test_motions_in_turn_are_solved_as_each_alone() -> None:
     """What a solver keeps of the last motions belongs to them, and to its own numbers."""
     torch.manual_seed(0)
@@ -341,6 +393,65 @@ def test_frames_solved_through_the_light_path_show_the_target(solved) -> None:
     assert (slim - pooled[1]).square().mean() < 0.02 * blind
     network.load_state_dict(network.state_dict() | {"frames.static": torch.zeros(len(network.frames.static))})
     assert known < 0.2 * change()
+
+
+def test_a_network_learns_from_drawn_sequences(solved, tmp_path, monkeypatch) -> None:
+    """Behind a setup that says what to draw; what was interrupted goes on, and a fine-tuning mixes them in."""
+    dataset, _ = solved
+    plan = replace(PLAN, network=SOLVING, epochs=2, drawn=48)
+    with pytest.raises(ConfigError, match=r"has no training\.yaml"):
+        train(dataset, plan, tmp_path / "none")
+    monkeypatch.setattr("evnlos.models.drawn._DRAWN", 16)
+    training = Simulation(glyphs=HandwritingGlyphs(characters="BCEFHLT", writers=2), setup=RadiometricSetup())
+    folder = Path(dataset.sampling.setup).parent
+    save_yaml(to_dict(training), folder / "training.yaml")
+    try:
+        whole = train(dataset, plan, tmp_path / "whole", captures=dataset)
+        targets = DRAWN.load(folder / "drawn.safetensors", "")
+        assert targets.masks.shape == (16, 64, 64) and targets.about.size_m == 0.08
+        assert evaluate(whole.load(), dataset, "train").scores.mean()["psnr_db"] > 12
+
+        def stop(step: Step) -> None:
+            if step.done == 1 and step.unit == "epochs":
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            train(dataset, plan, tmp_path / "parts", progress=stop, captures=dataset)
+        parts = train(dataset, plan, tmp_path / "parts", captures=dataset)
+        assert parts.file.read_bytes() == whole.file.read_bytes()
+        tuned = train(dataset, replace(plan, drawn=20, keep_normalization=True), tmp_path / "t", whole.folder)
+        assert len(tuned.records) == 2 and tuned.file.read_bytes() != whole.file.read_bytes()
+    finally:
+        (folder / "training.yaml").unlink()
+    with pytest.raises(ConfigError, match="leave --drawn at 0"):
+        train(dataset, replace(PLAN, network=UNetConfig(width=4, depth=1), drawn=8), tmp_path / "unet")
+    with pytest.raises(ConfigError, match=r"Training\.drawn is -1"):
+        replace(PLAN, drawn=-1)
+
+
+def test_events_of_drawn_targets_show_them(solved, tmp_path) -> None:
+    """With much information and no error: the targets by the prior's patterns, on the canvas's pixels."""
+    dataset, _ = solved
+    setup = load_setup(dataset.sampling.setup)
+    save_yaml(to_dict(setup), tmp_path / "setup.yaml")
+    prior, grid = event_prior(setup), network().grid
+    known = {"scores": torch.zeros(5, 120), "information": 1e10 * torch.eye(120)}
+    EVENT_ERRORS.write(tmp_path / EVENT_ERRORS_FILE, known, AboutErrors(tuple("ABCDE")))
+    target = FontGlyphs(characters="F").target("comic_neue_bold_F").rasterise(prior.target_plane)
+    at = torch.stack([torch.linspace(-0.05, 0.05, 40), torch.linspace(0.0, 0.01, 40)], dim=1)
+    by_patterns = np.clip(prior.image(prior.coefficients(target)), 0, 1)
+    shown = Target("F", by_patterns.astype(np.float32), 0.08).rasterise(Plane(64, 96, PITCH_M), at)
+    expected = grid.mean(torch.from_numpy(shown), at)
+    plane = grid.of_target(torch.from_numpy(target)[None].float(), 0.08)
+    for surface in ("likelihood", "corrected"):
+        sampling = Sampling(surface=surface, setup=str(tmp_path))
+        events = DrawnEvents(sampling, grid, lambda images: 2 * images, at)
+        images = events(plane, torch.Generator().manual_seed(0))
+        assert images.shape == (1, 2, 80, 80)
+        for image in images[0] / 2:
+            assert (image - expected).square().mean() < 0.02 * expected.var()
+    with pytest.raises(ConfigError, match=r"has no events\.safetensors"):
+        DrawnEvents(Sampling(setup=str(tmp_path / "none")), grid, torch.abs, at)
 
 
 def test_frames_are_not_solved_without_a_setup(tiny_dataset, tmp_path) -> None:

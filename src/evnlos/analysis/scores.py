@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from evnlos.data import Capture, Sampling, character_of
 from evnlos.errors import DataError
 from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
-from evnlos.models.sequence import TargetGrid
+from evnlos.models.drawn import TargetGrid
 from evnlos.scene import Target
 from evnlos.tensor_file import read_sealed
 

@@ -58,7 +58,6 @@ _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
 _SLOW_PX = 1_000  # of the fit of a model that is slow to simulate
 _MOST_CAPTURES = 16  # that tell of errors: a second or two each
-_LEAST_GAIN_DB = 0.3  # of captures corrected by others; with less the correction is not worth a trial
 
 
 @dataclass(frozen=True)
@@ -320,10 +319,9 @@ def write_event_errors(
 ) -> EventErrors | None:
     """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
 
-    The surface `corrected` takes it into account: for a capture that is among these, what the others showed.
-    Whether a network gains by it, only that network tells (`evnlos.training.best_shown`): one of the setup's
-    own simulation has learned what the setup gets wrong of its events. Where captures, each corrected by the
-    others, do not gain at least 0.3 dB before any network, there is nothing to try, and no file is written.
+    Newly drawn sequences err as it says (`evnlos.models.DrawnSequences`), and the surface `corrected` takes it
+    into account: for a capture that is among these, what the others showed. Whether a network gains by that,
+    only that network tells (`evnlos.training.best_shown`); captures tell what they gain before any network.
 
     Args:
         setup: Folder of a calibrated setup.
@@ -334,8 +332,8 @@ def write_event_errors(
         workers: Processes that solve the captures; 0 is one for each core.
 
     Returns:
-        The errors; None, and no file is there, where captures do not gain from them, none shows them, or no law
-        of the setup's event model is known.
+        The errors; None, and no file is there, where no capture shows them, or no law of the setup's event
+        model is known.
     """
     learned = [folder for folder in captures if folder.resolve().name in names]
     learned = learned[:: max(1, -(-len(learned) // _MOST_CAPTURES))]
@@ -363,7 +361,5 @@ def write_event_errors(
     }
     errors = EventErrors(AboutErrors(tuple(one.name for one in solved)), **tensors)
     about = replace(errors.about, gain_db=errors.gain_db(statistics, prior, truths))
-    if about.gain_db < _LEAST_GAIN_DB:
-        return None
     EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, about)
     return replace(errors, about=about)

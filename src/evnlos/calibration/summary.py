@@ -23,15 +23,18 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.registry import __version__
 from evnlos.scene import HandwritingGlyphs
-from evnlos.setups import CALIBRATED_FILE, FittedSetup
+from evnlos.setups import CALIBRATED_FILE, TRAINING_FILE, FittedSetup
 
-TRAINING_FILE, CALIBRATION_VALUES_FILE = "training.yaml", "calibration.json"
+CALIBRATION_VALUES_FILE = "calibration.json"
 TARGETS = "targets"
 """Folder, beside the setup's file, of the known targets' images."""
 
 _SOME_OF_COUNTS = 1.1  # times what noise leaves of counts held out: from there on less comes of events
 _MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
 _GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
+
+EVENT_RESIDUALS = ("counts held out", "surfaces held out")
+"""Residuals that the event pixel decides; where they got worse the light path still stands."""
 
 _UNTOLD = "not told by unknown targets: arbitrary"
 _ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
@@ -178,13 +181,24 @@ def _to_train_on(fit: SetupFit) -> Simulation:
     return randomized(fit.training, walls=fit.unexplained is not None)
 
 
+def _went(fit: SetupFit, name: str) -> str:
+    """Return in words what became of a residual."""
+    r = fit.residuals[name]
+    return f"{name}: the residual went from {100 * r.before:.1f} % to {100 * r.after:.1f} %"
+
+
 def _event_warnings(fit: SetupFit) -> list[str]:
     """Return where the event pixel does not make what the camera recorded."""
     counts = fit.residuals.get("counts held out")
     if fit.pixel is None or counts is None:
         return []
     found = []
-    if counts.after > _MOST_OF_COUNTS * counts.noise and counts.unexplained > _LEAST_OF_COUNTS:
+    if worse := [name for name in fit.worse if name in EVENT_RESIDUALS]:
+        found.append(
+            f"{_went(fit, worse[0])}: the fitted event pixel is no nearer to this sensor than the usual one, "
+            "so do not rely on events; train with frames, or fine-tune on captures"
+        )
+    elif counts.after > _MOST_OF_COUNTS * counts.noise and counts.unexplained > _LEAST_OF_COUNTS:
         found.append(
             f"counts held out: {100 * counts.after:.0f} % is left where noise alone leaves "
             f"{100 * counts.noise:.0f} %: this sensor is not of the event model's kind, so do not rely on a "
@@ -296,13 +310,10 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
     write_atomically(
         out / CALIBRATION_VALUES_FILE, json.dumps(calibration_values(fit, rows), indent=2).encode()
     )
-    if fit.worse and not force:
-        name = fit.worse[0]
-        r = fit.residuals[name]
+    if (of_frames := [name for name in fit.worse if name not in EVENT_RESIDUALS]) and not force:
         raise DataError(
-            f"{name}: the residual went from {100 * r.before:.1f} % to {100 * r.after:.1f} %, so it is no fit "
-            "of the setup and no setup file was written; check that all captures show one unmoved setup, try "
-            "another --preset or start, or --no-events where only events got worse"
+            f"{_went(fit, of_frames[0])}, so it is no fit of the setup and no setup file was written; check "
+            "that all captures show one unmoved setup, or try another --preset or start"
         )
     if fit.targets == "unknown" and fit.unexplained is not None and not force:
         raise DataError(

@@ -90,9 +90,10 @@ class CalibrateCommand:
             write_event_errors,
             write_setup,
         )
-        from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
+        from evnlos.calibration.summary import check_out, expectation
         from evnlos.data import captures_in
         from evnlos.plot.results import draw_calibration
+        from evnlos.setups import TRAINING_FILE
 
         check_out(self.out, self.force)
         if any(path.is_dir() for path in self.captures):
@@ -119,6 +120,8 @@ class CalibrateCommand:
             )
             print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")
             print(expectation(fit))
+        if fit.worse and not self.force:
+            raise SystemExit(1)
 
 
 @dataclass(frozen=True)

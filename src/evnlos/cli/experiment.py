@@ -99,9 +99,8 @@ class ExperimentCommand:
     validation: tuple[str, ...] = ()
     """Characters to choose settings on: only these are scored, the test characters are not even read."""
     folds: int = 0
-    """Deal the characters into so many folds, an even number, and test each fold by networks that learned from
-    the others: every character is tested once, and --test is not used. Two calibrations and pre-trainings serve
-    all folds, each for the half that it has not seen. 0: test --test alone."""
+    """Deal the characters into so many folds, an even number, and test each by networks that learned from the
+    others; two calibrations and pre-trainings serve the half that each has not seen. 0: test --test alone."""
     writers: int | None = None
     """Writers of the simulation, 36 objects each; by default the experiment's own number."""
     pretrain_epochs: int | None = None
@@ -125,7 +124,7 @@ class ExperimentCommand:
     def check_names(self) -> None:
         """Refuse the name of no experiment."""
         if self.name == "mismatch":
-            from evnlos.mismatch import mismatch_setups
+            from evnlos.studies import mismatch_setups
 
             mismatch_setups(self.setups, self.captures)
         known = (*experiment.STUDIES, *_WITHOUT_CAPTURES)
@@ -205,16 +204,17 @@ class ExperimentCommand:
         return replace(arm, pretraining=pre, finetuning=fine)
 
     def _simulation(self) -> None:
-        settings = experiment.Simulated(
-            self.out, modalities=self.modalities, seeds=self.seeds, workers=self.workers, force=self.force
-        )
-        parts, epochs = ("pretraining", "finetuning", "end_to_end"), ("pretrain", "finetune", "e2e")
-        numbers = [getattr(self, f"{name}_epochs") for name in epochs]
-        changed = {p: replace(getattr(settings, p), epochs=n) for p, n in zip(parts, numbers, strict=True) if n}
+        from evnlos.studies import SIMULATION, Simulated, run_simulated
+
+        asked = ("out", "modalities", "seeds", "workers", "force")
+        settings = Simulated(**{name: getattr(self, name) for name in asked})
+        epochs = self.pretrain_epochs, self.finetune_epochs, self.e2e_epochs
+        trainings = zip(("pretraining", "finetuning", "end_to_end"), epochs, strict=True)
+        changed = {p: replace(getattr(settings, p), epochs=n) for p, n in trainings if n}
         settings = replace(settings, writers=self.writers or settings.writers, **changed)
         with ProgressBars() as progress:
-            experiment.run_simulated(settings, progress)
-        text, everything = "", experiment.read_records(self.out / "records" / "simulation")
+            run_simulated(settings, progress)
+        text, everything = "", experiment.read_records(self.out / "records" / SIMULATION)
         for tested in ("nist", "comic"):
             text += _tables("simulation", [r for r in everything if r.setup == tested], self.metric) + "\n"
         write_atomically(self.out / "simulation.md", text.encode())
@@ -251,7 +251,7 @@ class ExperimentCommand:
         drawn(shown, lambda: draw_confidence(checks, shown))
 
     def _mismatch(self) -> None:
-        from evnlos.mismatch import mismatch_table, run_mismatch
+        from evnlos.studies import mismatch_table, run_mismatch
 
         names = ("out", "test", "modalities", "workers", "force", "robust", "writers")
         names += ("pretrain_epochs", "finetune_epochs", "e2e_epochs")

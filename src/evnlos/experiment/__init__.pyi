@@ -14,8 +14,6 @@ from .run import captures_of as captures_of
 from .run import folds_of as folds_of
 from .run import run_studies as run_studies
 from .run import run_study as run_study
-from .simulated import Simulated as Simulated
-from .simulated import run_simulated as run_simulated
 from .study import Arm as Arm
 from .study import Place as Place
 from .study import Record as Record

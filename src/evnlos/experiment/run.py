@@ -27,6 +27,7 @@ from evnlos.errors import CalibrationError, ConfigError, DataError, MissingDepen
 from evnlos.experiment.study import Arm, Place, Record, Study, slug
 from evnlos.experiment.table import score_arm
 from evnlos.machine import Progress, Step, silent
+from evnlos.models import drawn_targets
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import calibrated_file
 from evnlos.training import Training, augmented, best_shown, choose_and_finetune, train
@@ -44,6 +45,7 @@ class Run:
         out: Its folder.
         start: Run, or name of installed weights, whose weights it starts from; None: random ones.
         choose: Whether captures held out decide how much of a fine-tuning is taken.
+        captures: What shows a pre-training the errors of its setup.
     """
 
     data: tuple[Dataset, ...]
@@ -51,6 +53,7 @@ class Run:
     out: Path
     start: Path | str | None = None
     choose: bool = False
+    captures: Dataset | None = None
 
 
 def train_one(run: Run, progress: Progress = silent) -> None:
@@ -61,7 +64,7 @@ def train_one(run: Run, progress: Progress = silent) -> None:
     if run.choose and run.start is not None:
         choose_and_finetune(data, (run.settings,), run.out, run.start, progress=progress)
         return
-    train(data, run.settings, run.out, run.start, progress)
+    train(data, run.settings, run.out, run.start, progress, run.captures)
 
 
 def run_study(study: Study, place: Place, progress: Progress = silent) -> list[Record]:
@@ -136,12 +139,12 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
-    from evnlos.inverse import EVENT_ERRORS_FILE  # which compiles
+    from evnlos.inverse import gains_by_errors  # which compiles
 
     networks = list[_Network]()
     for arm in study.arms:
         recorded = (_import(study, arm, place, progress),)
-        if sees_events and arm.sampling.is_solved and arm.finetuning and (setup / EVENT_ERRORS_FILE).is_file():
+        if sees_events and arm.sampling.is_solved and arm.finetuning and gains_by_errors(setup):
             corrected = replace(arm, sampling=replace(arm.sampling, surface="corrected"))
             recorded += (_import(study, corrected, place, progress),)
         made = _simulate(study, arm, place, progress)
@@ -299,15 +302,9 @@ def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset
     held = study.test if not study.validation else ()
     chosen = _chosen(study, arm, place)
     pattern = load_pattern(place.out / "setups" / study.setup) if study.correct_pattern else None
-    key = config_hash(
-        {
-            "captures": [f.name for f in chosen],
-            "sampling": to_dict(arm.sampling),
-            "test": list(held),
-            "validation": list(study.validation),
-            "pattern": pattern and pattern.digest,
-        }
-    )
+    seen: dict[str, Any] = {"captures": [f.name for f in chosen], "sampling": to_dict(arm.sampling)}
+    seen |= {"test": list(held), "validation": list(study.validation), "pattern": pattern and pattern.digest}
+    key = config_hash(seen)
     out = place.out / "recorded" / f"{study.setup}-{key[:8]}"
     how = {"test": held, "validation": study.validation, "pattern": pattern, "workers": place.workers}
     return import_captures(chosen, out, arm.sampling, **how, progress=progress)
@@ -340,11 +337,14 @@ def _planned(
         assert made is not None
         settings = replace(arm.first_training(modality), modality=modality, seed=seed)
         decides: dict[str, Any] = {"data": made.config_hash, "settings": to_dict(settings)}
+        if settings.drawn:
+            drawn_targets(made.sampling.setup, place.workers)  # before several trainings want them
+            decides["errors of"] = recorded[0].folder.name
         if begin is not None:
             decides["from"] = arm.start
         key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.setup}-pretrained-{modality}-seed{seed}-{key}"
-        runs.append(Run((made,), settings, out, begin))
+        runs.append(Run((made,), settings, out, begin, captures=recorded[0] if settings.drawn else None))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
         settings = replace(arm.finetuning, modality=modality, seed=seed)

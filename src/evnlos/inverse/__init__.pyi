@@ -17,6 +17,8 @@ from .event_images import EVENT_ERRORS_FILE as EVENT_ERRORS_FILE
 from .event_images import AboutErrors as AboutErrors
 from .event_images import EventErrors as EventErrors
 from .event_images import event_images as event_images
+from .event_images import event_prior as event_prior
+from .event_images import gains_by_errors as gains_by_errors
 from .event_likelihood import LikelihoodSettings as LikelihoodSettings
 from .event_likelihood import SequenceEstimate as SequenceEstimate
 from .event_likelihood import estimate_sequence as estimate_sequence
@@ -38,6 +40,7 @@ from .operators import operator_norm as operator_norm
 from .operators import ridge_by_groups as ridge_by_groups
 from .operators import unexplained as unexplained
 from .prior import PatternPrior as PatternPrior
+from .prior import ScoreErrors as ScoreErrors
 from .prior import handwritten_prior as handwritten_prior
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem

@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from evnlos.errors import ConfigError, DataError, UnknownNameError
-from evnlos.inverse.prior import PatternPrior, handwritten_prior
+from evnlos.inverse.prior import PatternPrior, ScoreErrors, handwritten_prior
 from evnlos.inverse.sequence_light import EVENT_PRIORS, sequence_light
 from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
 from evnlos.machine import note
 from evnlos.scene import LineMotion, Motion, Target, TargetPlane
-from evnlos.setups import load_setup
+from evnlos.setups import Setup, load_setup
 from evnlos.tensor_file import TensorFile
 from evnlos.types import Events, Plane
 
@@ -43,6 +43,7 @@ EVENT_ERRORS_FILE = "events.safetensors"
 
 _SPAN_US = 100_000  # first and last instant are multiples of it, so that clocks that jitter share a light path
 _FEWEST = 4  # captures that tell of errors
+_LEAST_GAIN_DB = 0.3
 _LEAST = 1e-6  # noise of a coefficient, in the mean of all
 
 
@@ -86,21 +87,10 @@ class EventErrors:
             capture: Name of their capture, which does not count; fewer than 4 others change nothing.
         """
         others = self.scores.double().numpy()[[name != capture for name in self.about.captures]]
-        number, count = others.shape
-        if number < _FEWEST:
+        if len(others) < _FEWEST:
             return statistic
-        root = np.linalg.cholesky(self.information.double().numpy() + np.eye(count))
-        seen = np.linalg.solve(root, others.T)  # of variance 1 each if the setup is right
-        mean = seen.mean(axis=1)
-        rest = seen - mean[:, None]
-        total = float(np.square(rest).sum()) / (number - 1)
-        # Of the mean and of the scatter, what noise alone would leave is no error (James and Stein).
-        mean *= max(0.0, 1.0 - total / number / max(float(mean @ mean), 1e-12))
-        rest *= np.sqrt(max(0.0, 1.0 - count / max(total, 1e-12)) / (number - 1))
-        spread, a = root @ rest, statistic.information
-        noise = a + spread @ spread.T + _LEAST * np.trace(a) / count * np.eye(count)
-        pushed = np.linalg.solve(noise, a).T  # A N^-1
-        return EventStatistic(statistic.z, pushed @ a, pushed @ (statistic.score - root @ mean))
+        errors = ScoreErrors.of(others, self.information.double().numpy(), 1.0)
+        return counted(statistic, errors)
 
     def gain_db(
         self, statistics: Sequence[EventStatistic], prior: PatternPrior, truths: Sequence[NDArray[np.floating]]
@@ -123,6 +113,19 @@ class EventErrors:
         return float(np.mean(gains))
 
 
+def counted(statistic: EventStatistic, errors: ScoreErrors) -> EventStatistic:
+    """Return what events say once the errors of their setup count: the mean taken away, the scatter as noise.
+
+    Args:
+        statistic: What they say if the setup is right.
+        errors: What the setup gets wrong of scores.
+    """
+    a, count = statistic.information, len(statistic.information)
+    noise = a + errors.spread @ errors.spread.T + _LEAST * np.trace(a) / count * np.eye(count)
+    pushed = np.linalg.solve(noise, a).T  # A N^-1
+    return EventStatistic(statistic.z, pushed @ a, pushed @ (statistic.score - errors.mean))
+
+
 EVENT_ERRORS = TensorFile(
     "evnlos-event-errors-1",
     ("scores", "information"),
@@ -132,6 +135,18 @@ EVENT_ERRORS = TensorFile(
     "the file that `evnlos calibrate` wrote beside setup.yaml",
 )
 """Errors of events on disk."""
+
+
+def gains_by_errors(setup: Path) -> bool:
+    """Return whether captures gain before any network where what others showed of errors is taken from events.
+
+    With less than 0.3 dB there is nothing to try.
+
+    Args:
+        setup: Folder of a calibrated setup.
+    """
+    path = setup / EVENT_ERRORS_FILE
+    return path.is_file() and EVENT_ERRORS.load(path, "").about.gain_db >= _LEAST_GAIN_DB
 
 
 def event_statistic(
@@ -208,6 +223,11 @@ def event_images(
     return np.stack(images, axis=1)
 
 
+def event_prior(setup: Setup) -> PatternPrior:
+    """Return the prior over targets that events are solved with: letters as large as the setup's known ones."""
+    return handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS, ink=setup.ink)
+
+
 @lru_cache(maxsize=2)
 def _solver(
     setup: str, motion: Motion, span_s: tuple[float, float], shape: tuple[int, int]
@@ -221,8 +241,7 @@ def _solver(
             "folder of `evnlos calibrate` that the samples were made with, from where its name leads to it, or "
             "put a folder `near` beside weights `near-....safetensors`"
         ) from None
-    plane = Plane(CELLS, CELLS, TargetPlane().size_m / CELLS)
-    prior = handwritten_prior(plane, COEFFICIENTS, ink=known.ink)
+    prior = event_prior(known)
     note("light path of the events")
     light = sequence_light(known.seen_by(shape), prior, motion.position_m, span_s, shape)
     law = known.pixel.crossing_law(light.typical_dn)

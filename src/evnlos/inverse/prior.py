@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -240,3 +241,59 @@ def handwritten_prior(
     patterns = root.flip(1)
     rest = float(patterns[:, coefficients:].square().sum()) / len(patterns)
     return PatternPrior(target_plane, mean.numpy(), patterns[:, :coefficients].contiguous().numpy(), rest)
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreErrors:
+    """What a setup gets wrong of scores b = A z*, learned from known targets z*: b - A z* = m + S e + N e'.
+
+    e and e' are independent and of variance 1; S is what targets scatter by more than noise.
+
+    Args:
+        mean: m, what all share, float64 [k].
+        spread: S, float64 [k, C].
+        noise: N, float64 [k, k].
+    """
+
+    mean: Array
+    spread: Array
+    noise: Array
+
+    @classmethod
+    def of(cls, scores: Array, information: Array, noise: float | None = None) -> ScoreErrors:
+        """Return what known targets show; fewer than 2 show nothing but noise.
+
+        In units of the root of A + 1, of mean and scatter what noise alone would leave is no error (James and
+        Stein).
+
+        Args:
+            scores: b - A z* of each, [C, k].
+            information: A, [k, k].
+            noise: Variance of the noise where A counts it as 1; None: what the least of the scatter shows
+                (Marchenko and Pastur), as where A counts errors of the light path as noise.
+        """
+        number, count = scores.shape
+        root = np.asarray(np.linalg.cholesky(information + np.eye(count)), np.float64)
+        if number < 2:
+            alone = root if noise is None else root * math.sqrt(noise)
+            return cls(np.zeros(count), np.zeros((count, 0)), alone)
+        seen = np.linalg.solve(root, scores.T)
+        mean = seen.mean(axis=1)
+        rest = seen - mean[:, None]
+        total = float(np.square(rest).sum()) / (number - 1)
+        if noise is None:
+            free = min(number - 1, count)
+            least = float(np.linalg.eigvalsh(rest.T @ rest)[number - free]) / max(number - 1, count)
+            share = free / max(number - 1, count)
+            noise = float(min(least / max(1.0 - math.sqrt(share), 0.1) ** 2, total / count))
+        mean *= max(0.0, 1.0 - total / number / max(float(mean @ mean), 1e-12))
+        rest *= np.sqrt(max(0.0, 1.0 - count * noise / max(total, 1e-12)) / (number - 1))
+        return cls(root @ mean, root @ rest, root * math.sqrt(noise))
+
+    def draw(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Return errors of so many new targets, float64 [count, k]."""
+        drawn = torch.from_numpy(self.mean).expand(count, -1)
+        for part in (self.spread, self.noise):
+            own = torch.randn(count, part.shape[1], generator=generator, dtype=torch.float64)
+            drawn = drawn + own @ torch.from_numpy(part).T
+        return drawn

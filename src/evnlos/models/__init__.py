@@ -1,6 +1,7 @@
 """Reconstructors, their closed-form parts, the confidence in their images, and their weights on disk."""
 
 from evnlos.models.confidence import Confidence, ConfidenceReport, halves_of, on_target_plane
+from evnlos.models.drawn import DrawnSequences, drawn_targets
 from evnlos.models.embedding import FrameOperator
 from evnlos.models.reconstructor import (
     RECONSTRUCTORS,
@@ -30,6 +31,7 @@ __all__ = [
     "RECONSTRUCTORS",
     "Confidence",
     "ConfidenceReport",
+    "DrawnSequences",
     "FrameOperator",
     "LinearEstimate",
     "Reconstructor",
@@ -41,6 +43,7 @@ __all__ = [
     "UNetReconstructor",
     "Weights",
     "describe_network",
+    "drawn_targets",
     "find_weights",
     "fit_linear",
     "halves_of",

@@ -59,8 +59,7 @@ class Reconstructor(nn.Module, ABC):
     """What turns recorded maps into images of the hidden object; trainer, evaluation and apps know this alone.
 
     A kind that sees single time steps writes `forward`: inputs [B, C, H, W] to images [B, 1, H, W], 0..1. One
-    that sees whole sequences sets `sees_sequence`, and writes `draw` and `training_samples` too; its `forward`
-    takes the inputs of its training samples.
+    of sequences sets `sees_sequence`, writes `draw` and `training_samples` too, and its `forward` takes these.
 
     Args:
         modality: What it sees.
@@ -70,6 +69,8 @@ class Reconstructor(nn.Module, ABC):
 
     sees_sequence: ClassVar[bool] = False
     """Whether all time steps of an object together give its images; the motion must then be known."""
+    draws_sequences = False
+    """Whether it learns from newly drawn sequences, as all that it sees is solved (`SequenceReconstructor`)."""
     parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Parts whose weights a training may keep: name -> names of the submodules."""
 

@@ -1,6 +1,5 @@
 """The reconstructor of whole sequences: all time steps seen from the target plane, pooled, one image of it.
 
-- The target plane among the pixels of the canvas, and the way there and back.
 - What all frames of a sequence say of the target, through the light path of a setup: closed form.
 - The network behind what is pooled.
 """
@@ -26,7 +25,15 @@ from evnlos.inverse.operators import ridge_by_groups
 from evnlos.inverse.prior import handwritten_prior
 from evnlos.inverse.sequence_light import main_factors
 from evnlos.inverse.sequence_problem import SequenceOperator
-from evnlos.models.confidence import on_canvas
+from evnlos.models.drawn import (
+    DrawnEvents,
+    DrawnFrames,
+    DrawnSequences,
+    KnownSequence,
+    TargetGrid,
+    drawn_targets,
+    subset,
+)
 from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input
 from evnlos.models.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor
 from evnlos.models.unet import PARTS, PooledScale, ResidualUNet, UNetConfig
@@ -34,15 +41,6 @@ from evnlos.optics import MatrixTransport
 from evnlos.scene import TargetPlane
 from evnlos.setups import Setup, load_setup
 from evnlos.types import Plane, derive_seed
-
-PLANE_M = 0.1
-"""Side of the square around the target plane's centre that is drawn, metres: 8 cm and a margin."""
-
-FINER = 2
-"""Pixels of that square per pixel of the canvas: positions between pixels tell more than one of them does."""
-
-_CELLS = 4  # the square's side is a multiple of so many pixels
-_MOST_PIXELS = 4096  # along the square's side
 
 
 @RECONSTRUCTORS.register
@@ -75,75 +73,12 @@ class SequenceConfig(UNetConfig):
         return SequenceReconstructor(as_modality(modality), self, sampling)
 
 
-class TargetGrid:
-    """The square around the target plane's centre, `FINER` than the canvas, and the way there and back.
-
-    Args:
-        sampling: Size of the maps and their pitch on the target's canvas.
-
-    Raises:
-        ConfigError: The pitch is too fine for the square of 10 cm.
-    """
-
-    def __init__(self, sampling: Sampling) -> None:
-        pitch_m = sampling.pitch_m / FINER
-        self.side = max(1, round(PLANE_M / pitch_m / _CELLS)) * _CELLS
-        if self.side > _MOST_PIXELS:
-            raise ConfigError(
-                f"Sampling.pitch_m is {sampling.pitch_m}; a sequence network takes {PLANE_M / 2000:g} m or more"
-            )
-        # On the CPU wherever the layers are: the first arithmetic on the device "meta" imports for seconds.
-        across = (torch.arange(self.side, device="cpu") + 0.5 - self.side / 2) * pitch_m
-        self._place_m = torch.stack(torch.meshgrid(across, across, indexing="xy"), dim=-1)  # [P, P, 2]
-        self._canvas_m = torch.tensor([sampling.width, sampling.height], device="cpu") * sampling.pitch_m
-        self._side_m, self._canvas = self.side * pitch_m, sampling.canvas
-
-    def seen(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Return images [N, S, H, W] as seen from the plane, [N, S, P, P], and where, bool [N, P, P].
-
-        Args:
-            images: Images of the canvas.
-            position_m: The plane's centre on the canvas at each, (x, y) in metres, [N, 2].
-        """
-        grid, inside = self._grid(images, position_m)
-        moved = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
-        return moved * inside[:, None], inside
-
-    def inside(self, images: Tensor, position_m: Tensor) -> Tensor:
-        """Return which pixels of the plane lie on the canvas at each position, bool [N, P, P]."""
-        return self._grid(images, position_m)[1]
-
-    def _grid(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
-        place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
-        grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
-        return grid, (grid.abs() <= 1).all(dim=-1)
-
-    def mean(self, images: Tensor, position_m: Tensor) -> Tensor:
-        """Return the plane [P, P] that images [N, H, W] of all positions show: their mean."""
-        light, inside = self.seen(images[:, None].float(), position_m)
-        return light.sum(dim=0)[0] / inside.sum(dim=0).clamp_min(1)
-
-    def on_canvas(self, plane: Tensor, position_m: Tensor) -> Tensor:
-        """Return the target plane [P, P] on the canvas at each position [N, 2], metres: images [N, H, W].
-
-        Each pixel is the mean of `FINER` x `FINER` samples.
-        """
-        canvas = self._canvas
-        fine = Plane(canvas.height * FINER, canvas.width * FINER, canvas.pitch_m / FINER)
-        return F.avg_pool2d(on_canvas(plane, fine, position_m, self._side_m), FINER)
-
-    def of_target(self, target: Tensor, size_m: float) -> Tensor:
-        """Return targets [..., h, h] of a side in metres as seen on the square, [..., P, P]; 0 beside them."""
-        places = (self._place_m / (size_m / 2)).to(target)[None]
-        images = target.reshape(1, -1, *target.shape[-2:])
-        return F.grid_sample(images, places, align_corners=False).reshape(*target.shape[:-2], *2 * [self.side])
-
-
 _COEFFICIENTS, _CELLS_ACROSS = 150, 32  # of prior, target
 _FEWEST = 8  # objects to tell gain, offset and noise from
 _FEWEST_CAPTURES, _MOST_FRAMES, _PARTS = 4, 2048, 4  # that correct the light path; parts left out in turn
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
 _RIDGE, _AT_ONCE = 1e-6, 1024  # frames
+_MOST_KNOWN = 64  # sequences that tell errors
 _KEPT_ROWS = 3  # of as many motions: a sequence, its first half and its second
 
 
@@ -324,20 +259,63 @@ class PooledFrames(nn.Module):
             position_m: The target's centre at each, (x, y) in metres, [N, 2].
             kept: 1 where a subset has a time step, else 0, [K, N].
         """
-        rows, known, single = self._rows(position_m)  # J [N, k, r], along + A m [N, r], J J^T [N, k, k]
-        away = ((frames.float() - self.ambient).flatten(1) @ self.basis - known).double()
-        kept, static = kept.double(), self.static.double()
+        away = (frames.float() - self.ambient).flatten(1) @ self.basis - self._rows(position_m)[1]
+        return self.solved(*self.statistic(away, position_m, kept))
+
+    def statistic(self, away: Tensor, position_m: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
+        """Return information [K, k, k] and score [K, k] of subsets of the time steps, float64.
+
+        Args:
+            away: Components of the frames, less those of the mean target, [N, r].
+            position_m: The target's centre at each, [N, 2].
+            kept: 1 where a subset has a time step, else 0, [K, N].
+        """
+        rows, _, single = self._rows(position_m)  # J [N, k, r], J J^T [N, k, k]
+        away, kept, static = away.double(), kept.double(), self.static.double()
         share = static / (1.0 + kept.sum(dim=1, keepdim=True) * static)  # what an offset hides, [K, r]
         summed, shifts = torch.tensordot(kept, rows, dims=1), kept @ away  # [K, k, r], [K, r]
         information = torch.tensordot(kept, single, dims=1) - (summed * share[:, None]) @ summed.mT
         score = kept @ (rows @ away[:, :, None])[..., 0] - (summed @ (share * shifts)[:, :, None])[..., 0]
-        own = torch.eye(len(self.patterns), dtype=torch.float64, device=frames.device)
+        return information, score
+
+    def solved(self, information: Tensor, score: Tensor) -> Tensor:
+        """Return the targets of each weight of the prior, [K, S, h, h]; arguments of `statistic`."""
+        own = torch.eye(len(self.patterns), dtype=torch.float64, device=score.device)
         found = []
         for weight in self.weights:
             root = torch.linalg.cholesky(information + weight * own)
             z = torch.cholesky_solve(score[..., None], root)[..., 0].float()
             found.append(self.mean + torch.tensordot(z, self.patterns, dims=1))
         return torch.stack(found, dim=1)
+
+    def errors(self, frames: Tensor, truth: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
+        """Return by how much scores miss, [K, k], where the truth on the canvas is known: [N, H, W]."""
+        light = truth.float().flatten(1) @ self.light.flatten(1).T + self._terms(position_m) @ self.along
+        away = (frames.float() - self.ambient).flatten(1) @ self.basis - light
+        return self.statistic(away, position_m, kept)[1]
+
+    def foreseen(self, plane: Plane, position_m: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return M [K, k, cells], b [K, k] and the information [K, k, k]: the score of a target x is M x + b.
+
+        Args:
+            plane: Cells of the target.
+            position_m: As of `forward`.
+            kept: As of `forward`.
+        """
+        rows, known, _ = self._rows(position_m)
+        away = self._terms(position_m) @ self.along - known
+        information, base = self.statistic(away, position_m, kept)
+        carrier = MatrixTransport(self.light.flatten(1), self.sampling.canvas, (1, len(self.light)))
+        seen = torch.zeros(len(kept), len(self.light), plane.height * plane.width)
+        told = torch.zeros(len(kept), len(self.patterns), plane.height * plane.width)
+        for step, place in enumerate(position_m.cpu().double().numpy()):  # one at a time: all would not fit
+            light = SequenceOperator(carrier, plane, place[None]).matrix()[0]
+            mine = kept[:, step].nonzero()[:, 0]
+            seen[mine] += light
+            told[mine] += rows[step].float() @ light
+        static, summed = self.static, torch.tensordot(kept.float(), rows.float(), dims=1)
+        share = static / (1.0 + kept.sum(dim=1, keepdim=True) * static)
+        return told - (summed * share[:, None]) @ seen, base, information
 
     def keep(self, rank: int) -> None:
         """Forget all but the `rank` components that carry most light; see `LinearEmbeddings.keep`."""
@@ -415,7 +393,9 @@ class SequenceReconstructor(Reconstructor):
         images = self.embedding.images + (0 if self.frames is None else self.frames.images)
         self.scale = PooledScale(images)
         self.unet = ResidualUNet(images, settings)
+        self.draws_sequences = not self.embedding.groups
         self._corrects = False
+        self._own: dict[str, PooledFrames] = {}  # of captures that correct the light path: by others
         self.grid = TargetGrid(sampling)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -457,7 +437,7 @@ class SequenceReconstructor(Reconstructor):
         inputs, truth, names = [], [], []
         self.check_samples(samples, is_new=is_new)
         begins = self.frames is not None and (is_new or self._corrects)
-        own = self._fit_frames(samples, is_new=is_new) if begins else {}
+        self._own = own = self._fit_frames(samples, is_new=is_new) if begins else {}
         draw = np.random.default_rng(derive_seed(seed, "views"))
         device = next(self.parameters()).device
         for name in dict.fromkeys(samples.names.tolist()):
@@ -466,7 +446,7 @@ class SequenceReconstructor(Reconstructor):
             plane = self.grid.mean(samples.truth[torch.from_numpy(mine)], places).half().cpu()
             kept = torch.zeros(augmentations, len(mine))
             for number in range(augmentations):
-                kept[number, _subset(number, len(mine), draw)] = 1
+                kept[number, subset(number, len(mine), draw)] = 1
             seen = samples.inputs[torch.from_numpy(mine)].to(device)
             inputs.append(self.pooled_subsets(seen, places, kept, own.get(name)).half().cpu())
             truth += augmentations * [plane]
@@ -475,6 +455,46 @@ class SequenceReconstructor(Reconstructor):
         if is_new:
             self.scale.fit(found.inputs)
         return found
+
+    def drawn_sequences(
+        self, samples: NlosDataset, known: NlosDataset | None, seed: int, *, is_new: bool
+    ) -> DrawnSequences:
+        """Return sequences of newly drawn targets as `forward` sees them; see `models.drawn`.
+
+        Args:
+            samples: The samples of single time steps; a new network takes light path and scale from them.
+            known: Captures with known targets, which show what the setup gets wrong; None: the samples do.
+            seed: Seed of the sequences that the scale is taken from.
+            is_new: Whether light path and scale are taken; else `training_samples` was asked before.
+        """
+        if is_new and self.frames is not None:
+            self.check_samples(samples, is_new=True)
+            self._fit_frames(samples, is_new=True)
+        shown, parts = known or samples, list[Callable[[Tensor, torch.Generator], Tensor]]()
+        places = torch.from_numpy(shown.position_m)
+        if self.frames is not None:
+            solver, sequences = deepcopy(self.frames).cpu(), list[KnownSequence]()
+            every = list(dict.fromkeys(shown.names.tolist()))
+            for name in every[:: -(-len(every) // _MOST_KNOWN)]:
+                mine = torch.from_numpy(np.flatnonzero(shown.names == name))
+                seen = shown.inputs[mine][:, self._frame].cpu(), shown.truth[mine].cpu()
+                sequences.append(KnownSequence(*seen, places[mine], self._own.get(name, solver).cpu()))
+            parts.append(DrawnFrames(solver, sequences, self.grid))
+        if self.embedding.images:
+            of_one = places[shown.names == shown.names[0]]
+            parts.append(DrawnEvents(self.sampling, self.grid, self._scaled_events, of_one))
+        found = DrawnSequences(drawn_targets(self.sampling.setup), self.grid, parts)
+        if is_new:
+            few = [found.batch(64, derive_seed(seed, "scale", number))[0] for number in range(4)]
+            self.scale.fit(torch.cat(few).half())
+        return found
+
+    def _scaled_events(self, images: Tensor) -> Tensor:
+        """Return images [B, 2, P, P] of solved events as the normalization leaves them."""
+        (own,) = (self.modality.slices[g.name] for g in self.modality.groups if g.maps == ("surface",))
+        whole = images.new_zeros(len(images), self.modality.channels, *images.shape[2:])
+        whole[:, own] = images
+        return deepcopy(self.normalization).cpu()(whole)[:, own]
 
     def check_samples(self, samples: NlosDataset, *, is_new: bool) -> None:
         """Refuse samples of unknown motion, and those without a setup where frames are solved through one."""
@@ -577,13 +597,3 @@ class SequenceReconstructor(Reconstructor):
         if name.startswith("unet.standardise."):
             return f"scale.{name.rpartition('.')[2]}"
         return InputNormalization.today(name, modality)
-
-
-def _subset(number: int, steps: int, draw: np.random.Generator) -> NDArray[np.int64]:
-    """Return the time steps of subset `number`: 0 all, 1 every other, then at least a quarter at random."""
-    if number == 0 or steps == 1:
-        return np.arange(steps)
-    if number == 1:
-        return np.arange(0, steps, 2)
-    count = int(draw.integers(max(1, steps // 4), steps + 1))
-    return np.sort(draw.permutation(steps)[:count])

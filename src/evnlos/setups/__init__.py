@@ -1,7 +1,7 @@
 """Setups: wall, geometry, ambient light and cameras in one object, from names, files and measurements."""
 
 from evnlos.setups.base import Layout, OperatorNoise, Parameter, SensorSize, Setup, stated_distance_m
-from evnlos.setups.files import CALIBRATED_FILE, calibrated_file, calibrated_folder
+from evnlos.setups.files import CALIBRATED_FILE, TRAINING_FILE, calibrated_file, calibrated_folder
 from evnlos.setups.fitted import FittedSetup
 from evnlos.setups.load import (
     ROOMS,
@@ -19,6 +19,7 @@ from evnlos.setups.room import RoomSetup
 __all__ = [
     "CALIBRATED_FILE",
     "ROOMS",
+    "TRAINING_FILE",
     "FittedSetup",
     "Layout",
     "MeasuredSetup",

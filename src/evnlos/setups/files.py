@@ -276,6 +276,8 @@ def write_fitted(path: str | Path, wall: FittedWall) -> str:
 
 CALIBRATED_FILE = "setup.yaml"
 """The simulation that `evnlos calibrate` fits, in its folder."""
+TRAINING_FILE = "training.yaml"
+"""The same, varied, to pre-train on."""
 OLDER_FILE = "rig.yaml"  # its name in folders of before
 
 

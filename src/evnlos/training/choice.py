@@ -27,8 +27,8 @@ from evnlos.files import directory_lock
 from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
 from evnlos.models import Reconstructor, Weights, fit_linear, load_weights, save_weights
-from evnlos.training.settings import Training
-from evnlos.training.train import TrainingResult, about_run, check_run, train
+from evnlos.training.settings import Training, about_run, check_run
+from evnlos.training.train import TrainingResult, train
 from evnlos.types import derive_seed
 
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -4,27 +4,33 @@
 - Everything that decides a training.
 - Training settings by name: our fine-tuning, and the paper's (Wang et al., EPNP, section on training).
 - The whole state of a training in one safetensors file, so that a killed run goes on bit for bit.
+- What stands in a run's folder of settings, data and versions, and whether a folder is of this run.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import math
+import platform
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from evnlos.config import check_made
-from evnlos.data import as_modality
+from evnlos.config import LONG_YAML, check_made, differing_keys, from_dict, read_yaml, to_dict
+from evnlos.data import Dataset, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.files import write_atomically
+from evnlos.files import is_empty, write_atomically
 from evnlos.metrics import ssim
-from evnlos.models import Reconstructor, ReconstructorSettings, UNetConfig, describe_network
+from evnlos.models import Reconstructor, ReconstructorSettings, UNetConfig, Weights, describe_network
+from evnlos.registry import __version__, migrate
 from evnlos.tensor_file import read_sealed, sealed_bytes
+
+_LOG = logging.getLogger("evnlos")
 
 LossName = Literal["normalized_bce_mse_ssim", "paper"]
 
@@ -103,6 +109,10 @@ class Training:
     """`normalized_bce_mse_ssim` (bounded, does not collapse to black) or `paper` (L1 + 2/SSIM)."""
     sequence_augmentations: int = 3
     """Samples of each sequence, for networks that see it whole: all time steps, every other, random ones."""
+    drawn: int = 0
+    """Sequences of newly drawn targets an epoch, made in closed form and never twice the same: of a network of
+    whole sequences that sees frames and events solved through a calibrated setup. A pre-training learns from
+    them alone; the samples tell it light path and scale."""
     mirror: bool = False
     """Show half of the samples of each epoch upside down, input and image: further captures at no cost where
     the setup is symmetric about the height of the target; for networks that see single time steps."""
@@ -128,6 +138,8 @@ class Training:
         for name in ("epochs", "batch_size", "sequence_augmentations"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"Training.{name} is {getattr(self, name)}; give at least 1")
+        if self.drawn < 0:
+            raise ConfigError(f"Training.drawn is {self.drawn}; give 0, or a number of sequences an epoch")
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
             raise ConfigError(f"Training.learning_rate is {self.learning_rate}; give a positive number")
         check_made(self)
@@ -254,3 +266,75 @@ def _optimiser_state(
             value = torch.empty_like(parameter, requires_grad=False).copy_(value)
         state.setdefault(int(index), {})[field] = value
     return state
+
+
+def about_run(
+    dataset: Dataset, settings: Training, start: Weights | None, device: torch.device | None = None
+) -> dict[str, Any]:
+    """Return what `run.yaml` and the history of the weights say of a training: settings, data, versions.
+
+    Args:
+        dataset: Where the samples are.
+        settings: What decides the training.
+        start: Weights that it begins with, if any.
+        device: Where it runs, for a simulation that runs beside it.
+    """
+    return {
+        "settings": to_dict(settings),
+        "data": {
+            "origin": dataset.origin,
+            "name": dataset.folder.resolve().name,
+            "config_hash": dataset.config_hash,
+            "optics": dataset.optics,
+            "train": dataset.objects("train"),
+            "validation": dataset.split.get("validation", []),
+        },
+        "from": start.history[-1]["data"]["name"] if start and start.history else None,
+        "versions": {
+            "evnlos": __version__,
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+            "threads": torch.get_num_threads(),
+        },
+    }
+
+
+def tell_of_threads(out: Path) -> None:
+    """Warn where a run is taken up with another number of threads: sums are then taken in another order."""
+    if (out / "weights.safetensors").is_file():
+        return
+    versions = read_yaml(out / "run.yaml", LONG_YAML).get("versions")
+    stored, threads = versions.get("threads") if isinstance(versions, dict) else None, torch.get_num_threads()
+    if stored not in (None, threads):
+        _LOG.warning(
+            "warning: %s was begun with %s threads and goes on with %d: the weights will not be the same "
+            "to the byte; set OMP_NUM_THREADS=%s for that",
+            out,
+            stored,
+            threads,
+            stored,
+        )
+
+
+def check_run(out: Path, about: dict[str, Any]) -> None:
+    """Refuse a folder that is neither new nor of a run with the same settings and data.
+
+    Raises:
+        DataError: It holds another run, or something else.
+    """
+    path = out / "run.yaml"
+    if path.is_file():
+        stored = migrate("run", read_yaml(path, LONG_YAML))
+        if isinstance(stored.get("settings"), dict):
+            stored["settings"] = to_dict(from_dict(Training, stored["settings"], source=str(path)))
+        differing = differing_keys(
+            {key: about[key] for key in ("settings", "data")},
+            {key: stored.get(key) for key in ("settings", "data")},
+        )
+        if differing:
+            raise DataError(
+                f"{out} holds a run with other settings ({'; '.join(differing[:6])}); give another --out"
+            )
+        return
+    if not is_empty(out):
+        raise DataError(f"{out} is not empty and holds no run; give a new folder")

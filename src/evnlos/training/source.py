@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader
 from evnlos.data import InMemoryDataset, LiveDataset, Modality, NlosDataset
 from evnlos.errors import ConfigError
 from evnlos.machine import cores
-from evnlos.models import Reconstructor
+from evnlos.models import DrawnSequences, Reconstructor
 from evnlos.types import derive_seed
 
 
@@ -313,6 +313,47 @@ class SimulatedSource:
     def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> BatchSource:
         """Return this: a network of single time steps learns from them as they come."""
         return self
+
+
+class DrawnSource:
+    """Sequences of newly drawn targets, other ones each epoch, mixed with samples where there are any.
+
+    Args:
+        sequences: Makes them.
+        count: Their number in an epoch.
+        samples: What each batch shows beside them, by its number; None: nothing.
+        batch_size: Samples per step, of all processes together.
+        seed: Seed of the draws.
+        process_group: The processes.
+    """
+
+    def __init__(
+        self,
+        sequences: DrawnSequences,
+        count: int,
+        samples: InMemoryDataset | None,
+        batch_size: int,
+        seed: int,
+        process_group: ProcessGroup,
+    ) -> None:
+        self._sequences, self._seed, self._process_group = sequences, seed, process_group
+        others = 0 if samples is None else len(samples)
+        own = max(1, round(batch_size * others / (count + others))) if others else 0  # of a batch
+        self._others = None if samples is None else DiskSource(samples, own, seed, process_group)
+        self.steps = max(1, -(-count // batch_size)) if self._others is None else self._others.steps
+        self._each = max(1, round((batch_size - own) / process_group.size))
+
+    def batches(self, epoch: int) -> Iterator[Batch]:
+        """Yield this process's part of each batch."""
+        rank, size = self._process_group.rank, self._process_group.size
+        others = [None] * self.steps if self._others is None else self._others.batches(epoch)
+        for step, batch in enumerate(others):
+            seed = derive_seed(self._seed, "drawn", epoch, step, rank)
+            made = self._sequences.batch(self._each, seed)
+            seen, truth = (part.to(self._process_group.device) for part in made)
+            if batch is not None:
+                seen, truth = torch.cat([batch.seen, seen]), torch.cat([batch.truth, truth])
+            yield Batch(seen, truth, 1 / size, 1 / self.steps)
 
 
 def half_mirrored(seen: Tensor, truth: Tensor, seed: int) -> tuple[Tensor, Tensor]:

@@ -4,37 +4,47 @@ from __future__ import annotations
 
 import json
 import logging
-import platform
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch.utils.data import TensorDataset
 
-from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, read_yaml, save_yaml, to_dict
+from evnlos.config import LONG_YAML, config_hash, read_yaml, save_yaml
 from evnlos.data import Dataset, LiveDataset, Modality, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.files import directory_lock, is_empty, write_atomically
+from evnlos.files import directory_lock, write_atomically
 from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
-from evnlos.models import Confidence, Reconstructor, Weights, load_weights, save_weights
+from evnlos.models import (
+    Confidence,
+    Reconstructor,
+    SequenceReconstructor,
+    Weights,
+    drawn_targets,
+    load_weights,
+    save_weights,
+)
 from evnlos.models.confidence import FEWEST, fit_confidence
-from evnlos.registry import __version__, migrate
 from evnlos.training.settings import (
     LOSSES,
     Training,
+    about_run,
+    check_run,
     learning_rate_at,
     light_of,
     load_checkpoint,
     save_checkpoint,
+    tell_of_threads,
 )
 from evnlos.training.source import (
     BatchSource,
     DiskSource,
+    DrawnSource,
     ProcessGroup,
     SimulatedSource,
     half_mirrored,
@@ -76,6 +86,7 @@ def train(
     out: str | Path,
     weights: str | Path | None = None,
     progress: Progress = silent,
+    captures: Dataset | None = None,
 ) -> TrainingResult:
     """Train a network on a dataset's split `train`.
 
@@ -93,6 +104,8 @@ def train(
         out: The run's folder; new, or begun with the same settings.
         weights: Weights (or a run) to start from.
         progress: Called when the training begins and after each epoch, with its record.
+        captures: Captures with known targets, whose split `train` shows what the setup gets wrong: drawn
+            sequences (`Training.drawn`) err as they do. None: as those of the dataset do.
 
     Returns:
         The run's folder and the record of each epoch.
@@ -112,6 +125,7 @@ def train(
             f"mirror is on, and a reconstructor of kind {network.kind!r} sees whole sequences, which are not "
             "mirrored; leave it off"
         )
+    _check_drawn(network, settings)
     samples = None
     if not (isinstance(dataset, LiveDataset) or (out / "weights.safetensors").is_file()):
         samples = NlosDataset(dataset, "train", network.modality)
@@ -121,19 +135,20 @@ def train(
         if processes.rank == 0:
             stack.enter_context(directory_lock(out, check=lambda: check_run(out, about)))
             if (out / "run.yaml").is_file():
-                _tell_of_threads(out)
+                tell_of_threads(out)
             else:
                 save_yaml(about, out / "run.yaml")
         processes.wait()
         history = [*(start.history if start else []), about]
-        records = _epochs(network, dataset, samples, settings, out, history, processes, start, progress)
+        known = captures and NlosDataset(captures, "train", network.modality)
+        given = dataset, samples, known
+        records = _epochs(network, given, settings, out, history, processes, start, progress)
     return TrainingResult(out, records)
 
 
 def _epochs(
     network: Reconstructor,
-    dataset: Dataset,
-    samples: NlosDataset | None,
+    given: tuple[Dataset, NlosDataset | None, NlosDataset | None],
     settings: Training,
     out: Path,
     history: list[dict[str, Any]],
@@ -142,6 +157,7 @@ def _epochs(
     progress: Progress,
 ) -> list[dict[str, Any]]:
     """Run the epochs that are left, write the weights after the last, and return the records of all."""
+    (dataset, samples, known), seed = given, settings.seed
     checkpoint, metrics = out / "checkpoint.safetensors", out / "metrics.jsonl"
     what = f"train {out.name}"
     if (out / "weights.safetensors").is_file():
@@ -169,12 +185,20 @@ def _epochs(
     key = config_hash(read_yaml(out / "run.yaml", LONG_YAML)["settings"])
     goes_on = checkpoint.is_file()
     if not (goes_on and is_new):  # else what is fitted stands in the checkpoint
-        keep, seed = settings.keep_normalization, settings.seed
+        keep = settings.keep_normalization
         subset = with_mirrored(steps.subset) if settings.mirror else steps.subset
         network.fit(subset, seed, is_new=is_new, keep_normalization=keep)
     if goes_on and is_new:
         done, log = load_checkpoint(checkpoint, network, optimiser, key)
-    source = steps.for_network(network, settings.sequence_augmentations, is_new=is_new and not done)
+    begins = is_new and not done
+    source: BatchSource | DrawnSource = steps
+    if not (settings.drawn and is_new):
+        source = steps.for_network(network, settings.sequence_augmentations, is_new=begins)
+    if settings.drawn:
+        assert samples is not None
+        shown = source.samples if isinstance(source, DiskSource) and not is_new else None
+        drawn = cast(SequenceReconstructor, network).drawn_sequences(samples, known, seed, is_new=begins)
+        source = DrawnSource(drawn, settings.drawn, shown, *how)
     if goes_on and not is_new:  # its samples were those of the weights that it began with
         done, log = load_checkpoint(checkpoint, network, optimiser, key)
     if goes_on and leads:
@@ -247,6 +271,18 @@ def _network(settings: Training, start: Weights | None, sampling: Sampling) -> t
     return start.network, replace(settings, network=start.network.settings, modality=start.modality.name)
 
 
+def _check_drawn(network: Reconstructor, settings: Training) -> None:
+    """Refuse drawn sequences where nobody knows how to draw them; draw the targets where they are missing."""
+    if settings.drawn and not network.draws_sequences:
+        raise ConfigError(
+            f"drawn is {settings.drawn}; a network learns from drawn sequences only where frames "
+            "(--network.kind sequence --network.frames likelihood) and events (--sampling.surface likelihood) "
+            "are solved; leave --drawn at 0"
+        )
+    if settings.drawn:
+        drawn_targets(network.sampling.setup)
+
+
 def _check_data(dataset: Dataset, network: Reconstructor) -> None:
     """Refuse, before anything is written, what a training could not end with."""
     learned = dataset.objects("train")
@@ -276,78 +312,6 @@ def _half(settings: Training, device: torch.device) -> bool:
         return torch.cuda.is_bf16_supported()
     # Asked of the processor, not of oneDNN, which also says yes where it only emulates bf16, at half the speed.
     return torch.cpu._is_avx512_bf16_supported()
-
-
-def about_run(
-    dataset: Dataset, settings: Training, start: Weights | None, device: torch.device | None = None
-) -> dict[str, Any]:
-    """Return what `run.yaml` and the history of the weights say of a training: settings, data, versions.
-
-    Args:
-        dataset: Where the samples are.
-        settings: What decides the training.
-        start: Weights that it begins with, if any.
-        device: Where it runs, for a simulation that runs beside it.
-    """
-    return {
-        "settings": to_dict(settings),
-        "data": {
-            "origin": dataset.origin,
-            "name": dataset.folder.resolve().name,
-            "config_hash": dataset.config_hash,
-            "optics": dataset.optics,
-            "train": dataset.objects("train"),
-            "validation": dataset.split.get("validation", []),
-        },
-        "from": start.history[-1]["data"]["name"] if start and start.history else None,
-        "versions": {
-            "evnlos": __version__,
-            "torch": str(torch.__version__),
-            "python": platform.python_version(),
-            "threads": torch.get_num_threads(),
-        },
-    }
-
-
-def _tell_of_threads(out: Path) -> None:
-    """Warn where a run is taken up with another number of threads: sums are then taken in another order."""
-    if (out / "weights.safetensors").is_file():
-        return
-    versions = read_yaml(out / "run.yaml", LONG_YAML).get("versions")
-    stored, threads = versions.get("threads") if isinstance(versions, dict) else None, torch.get_num_threads()
-    if stored not in (None, threads):
-        _LOG.warning(
-            "warning: %s was begun with %s threads and goes on with %d: the weights will not be the same "
-            "to the byte; set OMP_NUM_THREADS=%s for that",
-            out,
-            stored,
-            threads,
-            stored,
-        )
-
-
-def check_run(out: Path, about: dict[str, Any]) -> None:
-    """Refuse a folder that is neither new nor of a run with the same settings and data.
-
-    Raises:
-        DataError: It holds another run, or something else.
-    """
-    path = out / "run.yaml"
-    if path.is_file():
-        stored = migrate("run", read_yaml(path, LONG_YAML))
-        if isinstance(stored.get("settings"), dict):
-            stored["settings"] = to_dict(from_dict(Training, stored["settings"], source=str(path)))
-        differing = differing_keys(
-            {key: about[key] for key in ("settings", "data")},
-            {key: stored.get(key) for key in ("settings", "data")},
-        )
-        if differing:
-            raise DataError(
-                f"{out} holds a run with other settings ({'; '.join(differing[:6])}); give another --out"
-            )
-        return
-    if not is_empty(out):
-        raise DataError(f"{out} is not empty and holds no run; give a new folder")
 
 
 HeldOut = NlosDataset | TensorDataset

@@ -1,0 +1,397 @@
+"""Where the target plane is among the pixels of a canvas, and sequences of targets that are newly drawn on it.
+
+- The target plane among the pixels of the canvas, and the way there and back.
+- Targets to draw: those of a calibrated setup's training, drawn once, bent anew each time.
+- What a network of whole sequences sees of them, in closed form: nothing is rendered or recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evnlos.config import config_hash, load_yaml, to_dict
+from evnlos.data import Sampling, Simulation
+from evnlos.data.pool import run_in_order
+from evnlos.errors import ConfigError
+from evnlos.inverse.event_images import EVENT_ERRORS, EVENT_ERRORS_FILE, counted, event_prior
+from evnlos.inverse.prior import ScoreErrors
+from evnlos.inverse.sequence_light import EVENT_PRIORS
+from evnlos.inverse.sequence_statistic import EventStatistic
+from evnlos.machine import note
+from evnlos.models.confidence import on_canvas
+from evnlos.scene import Glyphs, HandwritingGlyphs
+from evnlos.setups import TRAINING_FILE, load_setup
+from evnlos.tensor_file import TensorFile
+from evnlos.types import Plane
+
+PLANE_M = 0.1
+"""Side of the square around the target plane's centre that is drawn, metres: 8 cm and a margin."""
+
+FINER = 2
+"""Pixels of that square per pixel of the canvas: positions between pixels tell more than one of them does."""
+
+_CELLS = 4  # the square's side is a multiple of so many pixels
+_MOST_PIXELS = 4096  # along the square's side
+
+
+class TargetGrid:
+    """The square around the target plane's centre, `FINER` than the canvas, and the way there and back.
+
+    Args:
+        sampling: Size of the maps and their pitch on the target's canvas.
+
+    Raises:
+        ConfigError: The pitch is too fine for the square of 10 cm.
+    """
+
+    def __init__(self, sampling: Sampling) -> None:
+        self.pitch_m = pitch_m = sampling.pitch_m / FINER
+        self.side = max(1, round(PLANE_M / pitch_m / _CELLS)) * _CELLS
+        if self.side > _MOST_PIXELS:
+            raise ConfigError(
+                f"Sampling.pitch_m is {sampling.pitch_m}; a sequence network takes {PLANE_M / 2000:g} m or more"
+            )
+        # On the CPU wherever the layers are: the first arithmetic on the device "meta" imports for seconds.
+        across = (torch.arange(self.side, device="cpu") + 0.5 - self.side / 2) * pitch_m
+        self._place_m = torch.stack(torch.meshgrid(across, across, indexing="xy"), dim=-1)  # [P, P, 2]
+        self._canvas_m = torch.tensor([sampling.width, sampling.height], device="cpu") * sampling.pitch_m
+        self._side_m, self._canvas = self.side * pitch_m, sampling.canvas
+
+    def seen(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return images [N, S, H, W] as seen from the plane, [N, S, P, P], and where, bool [N, P, P].
+
+        Args:
+            images: Images of the canvas.
+            position_m: The plane's centre on the canvas at each, (x, y) in metres, [N, 2].
+        """
+        grid, inside = self._grid(images, position_m)
+        moved = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+        return moved * inside[:, None], inside
+
+    def inside(self, images: Tensor, position_m: Tensor) -> Tensor:
+        """Return which pixels of the plane lie on the canvas at each position, bool [N, P, P]."""
+        return self._grid(images, position_m)[1]
+
+    def _grid(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
+        place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
+        grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
+        return grid, (grid.abs() <= 1).all(dim=-1)
+
+    def mean(self, images: Tensor, position_m: Tensor) -> Tensor:
+        """Return the plane [P, P] that images [N, H, W] of all positions show: their mean."""
+        light, inside = self.seen(images[:, None].float(), position_m)
+        return light.sum(dim=0)[0] / inside.sum(dim=0).clamp_min(1)
+
+    def on_canvas(self, plane: Tensor, position_m: Tensor) -> Tensor:
+        """Return the target plane [P, P] on the canvas at each position [N, 2], metres: images [N, H, W].
+
+        Each pixel is the mean of `FINER` x `FINER` samples.
+        """
+        canvas = self._canvas
+        fine = Plane(canvas.height * FINER, canvas.width * FINER, canvas.pitch_m / FINER)
+        return F.avg_pool2d(on_canvas(plane, fine, position_m, self._side_m), FINER)
+
+    def of_target(self, target: Tensor, size_m: float) -> Tensor:
+        """Return targets [..., h, h] of a side in metres as seen on the square, [..., P, P]; 0 beside them."""
+        places = (self._place_m / (size_m / 2)).to(target)[None]
+        images = target.reshape(1, -1, *target.shape[-2:])
+        return F.grid_sample(images, places, align_corners=False).reshape(*target.shape[:-2], *2 * [self.side])
+
+    def target_of(self, planes: Tensor, size_m: float, cells: int) -> Tensor:
+        """Return the targets of a side in metres on so many cells, [B, h, h], that planes [B, P, P] show."""
+        share = size_m / self._side_m
+        affine = torch.tensor([[share, 0.0, 0.0], [0.0, share, 0.0]]).expand(len(planes), -1, -1)
+        grid = F.affine_grid(affine, [len(planes), 1, 2 * cells, 2 * cells], align_corners=False)
+        return F.avg_pool2d(F.grid_sample(planes[:, None], grid, align_corners=False), 2)[:, 0]
+
+
+DRAWN_FILE = "drawn.safetensors"
+"""Targets that were drawn for the training behind a setup, in its folder."""
+
+_DRAWN = 1024  # targets: more take long to draw, and what is bent anew is as good as new
+_SIDE, _AT_ONCE = 64, 32  # pixels of one; drawn at a time
+_TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.08, 0.07, 0.05, 0.12, 0.015, 0.03
+_WAVES = 5  # knots along a side of the field that bends
+_COUNT = 8  # subsets of the time steps
+
+
+@dataclass(frozen=True)
+class AboutDrawn:
+    """Description of a file of drawn targets."""
+
+    glyphs: str
+    """Hash of the settings that they were drawn by."""
+    size_m: float
+    """Side of the targets, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnTargets:
+    """Targets to learn from: masks, float16 [M, h, h], 0..1, and their side in metres."""
+
+    about: AboutDrawn
+    masks: Tensor
+
+
+DRAWN = TensorFile(
+    "evnlos-drawn-targets-1",
+    ("masks",),
+    AboutDrawn,
+    DrawnTargets,
+    "drawn targets",
+    "the file that a training behind a setup of `evnlos calibrate` writes to its folder",
+)
+"""Drawn targets on disk."""
+
+
+def drawn_targets(setup: str | Path, workers: int = 1) -> DrawnTargets:
+    """Return the targets to learn from behind a setup; where they are missing they are drawn and kept there.
+
+    They are those of its `training.yaml`: half letters and digits of many writers, half the known targets drawn
+    again, a thousand in all.
+
+    Args:
+        setup: Folder of `evnlos calibrate`.
+        workers: Processes that draw; 0 is one for each core.
+
+    Raises:
+        ConfigError: The folder says nothing of what to learn from.
+    """
+    folder = _folder(setup)
+    if not (folder / TRAINING_FILE).is_file():
+        raise ConfigError(
+            f"{setup or 'no setup'} has no {TRAINING_FILE}, which says what targets to draw; make the samples "
+            "with --sampling.setup FOLDER of `evnlos calibrate`, or leave --drawn at 0"
+        )
+    simulation = load_yaml(Simulation, folder / TRAINING_FILE)
+    glyphs = simulation.glyphs
+    if isinstance(glyphs, HandwritingGlyphs):
+        known = len(glyphs.objects()) - len(replace(glyphs, redrawn=0).objects()) if glyphs.redrawn else 0
+        known //= max(glyphs.redrawn, 1)
+        half = _DRAWN // 2 if known else _DRAWN
+        again = math.ceil(half / known) if known else 0
+        glyphs = replace(glyphs, writers=math.ceil(half / len(glyphs.characters)), redrawn=again)
+    key, path = config_hash(to_dict(glyphs) | {"seed": simulation.seed}), folder / DRAWN_FILE
+    if path.is_file():
+        found = DRAWN.load(path, "")
+        if found.about.glyphs == key:
+            return found
+    note("draw targets")
+    names = glyphs.objects()[:_DRAWN]
+    tasks = [names[k : k + _AT_ONCE] for k in range(0, len(names), _AT_ONCE)]
+    parts = run_in_order(partial(_drawn, glyphs, simulation.seed), tasks, workers)
+    masks, sizes = zip(*(pair for part in parts for pair in part), strict=True)
+    found = DrawnTargets(AboutDrawn(key, float(sizes[0])), torch.from_numpy(np.stack(masks)).half())
+    DRAWN.write(path, {"masks": found.masks}, found.about)
+    return found
+
+
+def _folder(setup: str | Path) -> Path:
+    """Return the folder of a setup that is named by it or by its file."""
+    path = Path(setup)
+    return path.parent if path.is_file() else path
+
+
+def _drawn(glyphs: Glyphs, seed: int, names: list[str]) -> list[tuple[NDArray, float]]:
+    """Return mask and side of some targets."""
+    found = list[tuple[NDArray, float]]()
+    for name in names:
+        target = glyphs.target(name, seed)
+        side = target.size_m / _SIDE
+        found.append((target.rasterise(Plane(_SIDE, _SIDE, side)).astype(np.float32), target.size_m))
+    return found
+
+
+def bent(planes: Tensor, generator: torch.Generator) -> Tensor:
+    """Return planes [B, P, P] turned, stretched, slanted, moved and bent a little, each at random."""
+    count = len(planes)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(count, *shape, generator=generator)
+
+    turn, slant = _TURN * normal(), _SLANT * normal()
+    wide, high = torch.exp(_WIDTH * normal()), torch.exp(_HEIGHT * normal())
+    rows = [turn.cos() * wide, slant - turn.sin() * high, turn.sin() * wide, turn.cos() * high]
+    affine = torch.cat([torch.stack(rows, dim=1).unflatten(1, (2, 2)), _PLACE * normal(2, 1)], dim=2)
+    grid = F.affine_grid(affine, [count, 1, *planes.shape[1:]], align_corners=False)
+    field = _BEND * normal(2, _WAVES, _WAVES)
+    field = F.interpolate(field, planes.shape[1:], mode="bicubic", align_corners=False)
+    grid = grid + field.permute(0, 2, 3, 1)
+    return F.grid_sample(planes[:, None], grid, align_corners=False)[:, 0].clamp(0, 1)
+
+
+class FrameSolver(Protocol):
+    """What frames are solved with: `PooledFrames`."""
+
+    target_plane: Plane
+
+    def errors(self, frames: Tensor, truth: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
+        """Return by how much the scores of a known target miss, [K, k]."""
+        ...
+
+    def foreseen(self, plane: Plane, position_m: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return M [K, k, cells], b [K, k] and information: the score of a target x is M x + b."""
+        ...
+
+    def solved(self, information: Tensor, score: Tensor) -> Tensor:
+        """Return the targets of each weight of the prior, [K, S, h, h]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class KnownSequence:
+    """A sequence of a known target: frames and truth [N, H, W], places [N, 2], and what solves its frames.
+
+    What the solver has learned from this very sequence would hide its errors: give one that has not.
+    """
+
+    frames: Tensor
+    truth: Tensor
+    position_m: Tensor
+    solver: FrameSolver
+
+
+def subsets(steps: int, count: int = _COUNT) -> Tensor:
+    """Return subsets of the time steps, [K, N]: all, every other, then at least a quarter at random."""
+    draw = np.random.default_rng(0)
+    kept = torch.zeros(count, steps)
+    for number in range(count):
+        kept[number, subset(number, steps, draw)] = 1
+    return kept
+
+
+def subset(number: int, steps: int, draw: np.random.Generator) -> NDArray[np.int64]:
+    """Return the time steps of subset `number`: 0 all, 1 every other, then at least a quarter at random."""
+    if number == 0 or steps == 1:
+        return np.arange(steps)
+    if number == 1:
+        return np.arange(0, steps, 2)
+    chosen = int(draw.integers(max(1, steps // 4), steps + 1))
+    return np.sort(draw.permutation(steps)[:chosen])
+
+
+class DrawnFrames:
+    """What the frames of newly drawn targets say, solved: b = M x + what known targets show that is missed.
+
+    Args:
+        solver: What they are solved with.
+        known: Sequences of known targets; those with as many time steps as most tell the errors.
+        grid: The square that is drawn.
+    """
+
+    def __init__(self, solver: FrameSolver, known: Sequence[KnownSequence], grid: TargetGrid) -> None:
+        lengths = [len(one.frames) for one in known]
+        usual = max(set(lengths), key=lengths.count)
+        alike = [one for one in known if len(one.frames) == usual]
+        self._solver, self._grid, self.kept = solver, grid, subsets(usual)
+        places = torch.stack([one.position_m for one in alike]).median(dim=0).values
+        cells = Plane(grid.side // FINER, grid.side // FINER, grid.pitch_m * FINER)
+        self._seen, self._base, self._information = solver.foreseen(cells, places, self.kept)
+        missed = [one.solver.errors(one.frames, one.truth, one.position_m, self.kept) for one in alike]
+        scores = torch.stack(missed, dim=1).numpy()  # [K, C, k]
+        self._errors = [
+            ScoreErrors.of(mine, own.numpy()) for mine, own in zip(scores, self._information, strict=True)
+        ]
+
+    def __call__(self, planes: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the solved images of planes [B, P, P], [B, S, P, P]: of all time steps, or of some."""
+        some = torch.rand((), generator=generator) < 0.5
+        k = int(torch.randint(len(self.kept), (), generator=generator)) if some else 0
+        cells = F.avg_pool2d(planes[:, None], FINER).flatten(1)
+        score = (cells @ self._seen[k].T).double() + self._base[k] + self._errors[k].draw(len(cells), generator)
+        found = self._solver.solved(self._information[k], score)
+        return self._grid.of_target(found, self._solver.target_plane.extent_m[0])
+
+
+class DrawnEvents:
+    """What the events of newly drawn targets say, solved: b = A z + what captures show that is missed.
+
+    Args:
+        sampling: Names the setup, and says whether its errors are taken from events (`corrected`).
+        grid: The square that is drawn.
+        scale: Brings images to the scale that the network sees, [B, 2, P, P] -> the same.
+        position_m: Places of the target in a sequence, [N, 2].
+
+    Raises:
+        ConfigError: The setup's folder says nothing of its errors.
+    """
+
+    def __init__(
+        self, sampling: Sampling, grid: TargetGrid, scale: Callable[[Tensor], Tensor], position_m: Tensor
+    ) -> None:
+        path = _folder(sampling.setup) / EVENT_ERRORS_FILE
+        if not path.is_file():
+            raise ConfigError(
+                f"{sampling.setup} has no {EVENT_ERRORS_FILE}, which says what events of known targets miss; "
+                "calibrate again, or leave --drawn at 0"
+            )
+        known = EVENT_ERRORS.load(path, "")
+        self._prior = event_prior(load_setup(sampling.setup))
+        self._grid, self._scale = grid, scale
+        a = known.information.double().numpy()
+        self._errors = ScoreErrors.of(known.scores.double().numpy(), a, 1.0)
+        corrects = sampling.surface == "corrected"
+
+        def solved(score: NDArray[np.float64]) -> NDArray[np.float64]:
+            statistic = EventStatistic(np.zeros(len(a)), a, score)
+            return (counted(statistic, self._errors) if corrects else statistic).solutions(EVENT_PRIORS)
+
+        # Solving is linear in the score: its matrix [n, k, k] and what it makes of none.
+        self._none = torch.from_numpy(solved(np.zeros(len(a))))
+        each = torch.from_numpy(np.stack([solved(one) for one in np.eye(len(a))], axis=-1))
+        self._back, self._information = each - self._none[..., None], torch.from_numpy(a)
+        spot = torch.zeros(grid.side, grid.side)
+        spot[grid.side // 2, grid.side // 2] = 1
+        spread = grid.mean(grid.on_canvas(spot, position_m), position_m)  # by the pixels of the canvas
+        near = slice(grid.side // 2 - 4, grid.side // 2 + 5)
+        self._blur = (spread[near, near] / spread.sum()).flip(-1, -2)[None, None]
+
+    def __call__(self, planes: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the solved images of planes [B, P, P], [B, 2, P, P]."""
+        prior, side = self._prior, self._prior.target_plane.height
+        patterns = torch.from_numpy(prior.patterns)
+        inner = self._grid.target_of(planes, prior.target_plane.extent_m[0], side).flatten(1).double()
+        z = (inner - torch.from_numpy(prior.mean)) @ (patterns / patterns.square().sum(dim=0))
+        score = z @ self._information + self._errors.draw(len(z), generator)
+        found = torch.einsum("nkl,bl->bnk", self._back, score) + self._none  # [B, n, k]
+        images = (torch.from_numpy(prior.mean) + found @ patterns.T).clamp(0, 1).unflatten(-1, (side, side))
+        seen = self._grid.of_target(images.float(), prior.target_plane.extent_m[0])
+        blurred = F.conv2d(seen.flatten(0, 1)[:, None], self._blur, padding="same").view_as(seen)
+        return self._scale(blurred)
+
+
+class DrawnSequences:
+    """Sequences of newly drawn targets as a network sees them, without end.
+
+    Args:
+        targets: What is drawn.
+        grid: The square that is drawn.
+        parts: Make the channels of planes, in their order.
+    """
+
+    def __init__(
+        self,
+        targets: DrawnTargets,
+        grid: TargetGrid,
+        parts: Sequence[Callable[[Tensor, torch.Generator], Tensor]],
+    ) -> None:
+        self._planes = grid.of_target(targets.masks.float(), targets.about.size_m)
+        self._parts = parts
+
+    def batch(self, count: int, seed: int) -> tuple[Tensor, Tensor]:
+        """Return inputs [B, S, P, P] and true images [B, 1, P, P], float32; the same for the same seed."""
+        generator = torch.Generator().manual_seed(seed)
+        chosen = torch.randint(len(self._planes), (count,), generator=generator)
+        planes = bent(self._planes[chosen], generator)
+        return torch.cat([part(planes, generator) for part in self._parts], dim=1), planes[:, None]
