@@ -517,6 +517,19 @@ def test_where_events_alone_are_left_the_wall_stays(fit, tmp_path) -> None:
     assert "setup.pixel.threshold_on" in wider and all(name.startswith("setup.pixel.") for name in wider)
 
 
+def test_events_that_fit_worse_leave_the_wall_and_are_warned_of(fit, tmp_path) -> None:
+    left = Residual(before=0.505, after=0.532, noise=0.35)
+    wrong = replace(fit, residuals={**fit.residuals, "counts held out": left})
+    counts, training = warnings_of(wrong)
+    assert counts.startswith("counts held out: the residual went from 50.5 % to 53.2 %")
+    assert training == "training.yaml draws event pixels from wide ranges around this fit"
+    assert "events: not to be trusted" in expectation(wrong)
+    assert write_setup(wrong, rows_of(wrong, EventPixel(), FrameCamera()), tmp_path / "written").exists()
+    frames = replace(wrong, residuals={**wrong.residuals, "frames held out": replace(left, noise=0.1)})
+    with pytest.raises(DataError, match=r"frames held out: the residual went from 50\.5 % to 53\.2 %"):
+        write_setup(frames, rows_of(frames, EventPixel(), FrameCamera()), tmp_path / "refused")
+
+
 def test_less_is_expected_of_events_whose_counts_are_left(fit) -> None:
     for after, less in ((0.47, False), (0.54, True)):
         left = Residual(before=0.62, after=after, noise=0.46)

@@ -423,6 +423,11 @@ def test_a_network_learns_from_drawn_sequences(solved, tmp_path, monkeypatch) ->
         assert len(tuned.records) == 2 and tuned.file.read_bytes() != whole.file.read_bytes()
     finally:
         (folder / "training.yaml").unlink()
+    with pytest.raises(ConfigError, match="drawn is 0"):
+        train(dataset, replace(plan, drawn=0), tmp_path / "none", captures=dataset)
+    other = replace(dataset, sampling=replace(dataset.sampling, pitch_m=0.004))
+    with pytest.raises(ConfigError, match="another canvas"):
+        train(dataset, plan, tmp_path / "none", captures=other)
     with pytest.raises(ConfigError, match="leave --drawn at 0"):
         train(dataset, replace(PLAN, network=UNetConfig(width=4, depth=1), drawn=8), tmp_path / "unet")
     with pytest.raises(ConfigError, match=r"Training\.drawn is -1"):

@@ -63,6 +63,9 @@ class TrainCommand:
     workers: int = 1
     """Processes that simulate beside the training, for --simulate; 0 = one for each core.
     A GPU wants several."""
+    captures: Path | None = None
+    """Imported captures with known targets: newly drawn sequences (--drawn) err as these do, in place of those
+    of --data."""
     force: bool = False
     """Begin --simulate although the machine's memory will hardly do."""
     preset: str = "default"
@@ -83,14 +86,24 @@ class TrainCommand:
         if (self.data is None) == (self.simulate is None):
             raise ConfigError("give --data DATASET or --simulate SETTINGS.yaml, one of the two")
         if self.data is not None:
-            fit(open_dataset(self.data), self.settings, self.out, None, self.json)
+            known = None if self.captures is None else open_dataset(self.captures)
+            fit(open_dataset(self.data), self.settings, self.out, None, self.json, known)
+        elif self.captures is not None:
+            raise ConfigError("--captures shows what drawn sequences err by, and they need --data DATASET")
         else:
             assert self.simulate is not None
             settings = load_yaml(Simulation, self.simulate)
             fit(live_dataset(settings, self.workers, self.force), self.settings, self.out, None, self.json)
 
 
-def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, as_json: bool) -> None:
+def fit(
+    dataset: Dataset,
+    settings: Training,
+    out: Path,
+    weights: Path | None,
+    as_json: bool,
+    captures: Dataset | None = None,
+) -> None:
     """Train with a progress bar over the epochs, and warn of a network that ignores its input.
 
     Of several processes that `torchrun` started, only the first speaks.
@@ -102,7 +115,7 @@ def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, a
             say(f"warning: the simulation's setup does not fit its captures: {misfit}")
 
     with ProgressBars(quiet) as progress:
-        trained = train(dataset, settings, out, weights, told_first(warn, progress))
+        trained = train(dataset, settings, out, weights, told_first(warn, progress), captures)
     if quiet:
         return
     record = trained.records[-1]

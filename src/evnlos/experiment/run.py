@@ -338,7 +338,7 @@ def _planned(
         settings = replace(arm.first_training(modality), modality=modality, seed=seed)
         decides: dict[str, Any] = {"data": made.config_hash, "settings": to_dict(settings)}
         if settings.drawn:
-            drawn_targets(made.sampling.setup, place.workers)  # before several trainings want them
+            drawn_targets(made.sampling.setup, place.workers)  # before several want them
             decides["errors of"] = recorded[0].folder.name
         if begin is not None:
             decides["from"] = arm.start
@@ -347,13 +347,11 @@ def _planned(
         runs.append(Run((made,), settings, out, begin, captures=recorded[0] if settings.drawn else None))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
-        settings = replace(arm.finetuning, modality=modality, seed=seed)
+        mixed = arm.finetuning.drawn * as_modality(modality).needs_frames  # captures tell more of events
+        settings = replace(arm.finetuning, modality=modality, seed=seed, drawn=mixed)
         start = runs[-1].out if runs else begin
-        decides = {
-            "data": " ".join(one.folder.name for one in recorded),
-            "settings": to_dict(settings),
-            "from": start and Path(start).name,
-        }
+        names = " ".join(one.folder.name for one in recorded)
+        decides = {"data": names, "settings": to_dict(settings), "from": start and Path(start).name}
         if arm.choose:
             decides["choose"] = True
         key = config_hash(decides)[:8]

@@ -125,7 +125,7 @@ def train(
             f"mirror is on, and a reconstructor of kind {network.kind!r} sees whole sequences, which are not "
             "mirrored; leave it off"
         )
-    _check_drawn(network, settings)
+    _check_drawn(network, settings, captures)
     samples = None
     if not (isinstance(dataset, LiveDataset) or (out / "weights.safetensors").is_file()):
         samples = NlosDataset(dataset, "train", network.modality)
@@ -271,8 +271,17 @@ def _network(settings: Training, start: Weights | None, sampling: Sampling) -> t
     return start.network, replace(settings, network=start.network.settings, modality=start.modality.name)
 
 
-def _check_drawn(network: Reconstructor, settings: Training) -> None:
+def _check_drawn(network: Reconstructor, settings: Training, captures: Dataset | None) -> None:
     """Refuse drawn sequences where nobody knows how to draw them; draw the targets where they are missing."""
+    if captures is not None and not settings.drawn:
+        raise ConfigError(
+            f"captures ({captures.folder.name}) show what drawn sequences err by, and drawn is 0; give --drawn "
+            "2000 or so, or leave them out"
+        )
+    if captures is not None and captures.sampling.canvas != network.sampling.canvas:
+        raise ConfigError(
+            f"{captures.folder.name} shows another canvas than the samples; import it with the same --sampling"
+        )
     if settings.drawn and not network.draws_sequences:
         raise ConfigError(
             f"drawn is {settings.drawn}; a network learns from drawn sequences only where frames "
