@@ -16,6 +16,7 @@ from evnlos.analysis.scores import aligned_mean
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate
+from evnlos.data.simulations import fitting
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import (
     EVENT_ERRORS,
@@ -27,7 +28,14 @@ from evnlos.inverse import (
     ridge_by_groups,
 )
 from evnlos.machine import Step
-from evnlos.models import FrameOperator, SequenceConfig, SequenceReconstructor, UNetConfig, load_weights
+from evnlos.models import (
+    FrameOperator,
+    SequenceConfig,
+    SequenceReconstructor,
+    UNetConfig,
+    load_weights,
+    on_target_plane,
+)
 from evnlos.models.drawn import DRAWN, DrawnEvents, subsets
 from evnlos.models.sequence import PooledFrames
 from evnlos.optics import MatrixTransport
@@ -58,6 +66,28 @@ def test_images_of_a_moving_target_meet_on_the_target_and_come_back() -> None:
     assert 10 * torch.log10(1 / error) > 27
     shuffled = net.grid.mean(truth, at.flip(0))
     assert (net.grid.on_canvas(shuffled, at) - truth).square().mean() > 4 * error
+
+
+def test_a_canvas_for_larger_targets_shows_them_as_the_usual_one_does() -> None:
+    usual, travel = Sampling(), (0.16, 0.0)
+    assert all(fitting(usual, size, travel) == usual for size in (0.05, 0.064, 0.08, 0.085))
+    assert fitting(usual, 0.12, travel).pitch_m == pytest.approx(0.00375)
+    assert fitting(usual, 0.04, (0.02, 0.0)).pitch_m == pytest.approx(0.00125)
+    assert fitting(usual, 0.04, travel).pitch_m == pytest.approx(0.2 / 96, abs=1e-6)
+    assert fitting(usual, 0.08, (0.3, 0.0)).pitch_m == pytest.approx(0.38 / 96, abs=1e-6)
+    assert fitting(usual, 0.08, (0.1, 0.1)).pitch_m == pytest.approx(0.18 / 48, abs=1e-6)
+    one, other = network(), SequenceReconstructor(as_modality("frame"), NET, fitting(usual, 0.12, travel))
+    images, at = torch.rand(3, 64, 96), torch.tensor([[-0.05, 0.0], [0.0, 0.01], [0.04, 0.0]])
+    plane = one.grid.mean(images, at)
+    torch.testing.assert_close(other.grid.mean(images, 1.5 * at), plane, rtol=1e-4, atol=1e-5)
+    again = (net.grid.on_canvas(plane, scale * at) for net, scale in ((one, 1.0), (other, 1.5)))
+    torch.testing.assert_close(*again, rtol=1e-4, atol=1e-5)
+    taken = (
+        on_target_plane(images, net.sampling.canvas, scale * at) for net, scale in ((one, 1.0), (other, 1.5))
+    )
+    torch.testing.assert_close(*taken, rtol=1e-4, atol=1e-5)
+    solver = PooledFrames(fitting(usual, 0.12, travel), (1.0,), 8)
+    assert solver.target_plane.extent_m == pytest.approx((0.12, 0.12))
 
 
 def test_single_positions_with_noise_of_their_own_gain_by_their_aligned_mean() -> None:
@@ -439,7 +469,7 @@ def test_events_of_drawn_targets_show_them(solved, tmp_path) -> None:
     dataset, _ = solved
     setup = load_setup(dataset.sampling.setup)
     save_yaml(to_dict(setup), tmp_path / "setup.yaml")
-    prior, grid = event_prior(setup), network().grid
+    prior, grid = event_prior(setup, 0.08), network().grid
     known = {"scores": torch.zeros(5, 120), "information": 1e10 * torch.eye(120)}
     EVENT_ERRORS.write(tmp_path / EVENT_ERRORS_FILE, known, AboutErrors(tuple("ABCDE")))
     target = FontGlyphs(characters="F").target("comic_neue_bold_F").rasterise(prior.target_plane)

@@ -320,6 +320,16 @@ class Plane:
         )
 
 
+def target_side_m(canvas: Plane) -> float:
+    """Return the side of the target plane that a canvas is made for, metres: a third of its width.
+
+    Example:
+        >>> round(target_side_m(Plane(64, 96, 0.0025)), 6)
+        0.08
+    """
+    return canvas.extent_m[1] / 3
+
+
 def matching_paths(given: Iterable[str | Path]) -> list[Path]:
     """Return paths in which a pattern, such as shots/*, stands for what it matches, as most shells have it.
 

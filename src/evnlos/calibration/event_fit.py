@@ -30,7 +30,8 @@ from evnlos.calibration.event_statistics import (
 )
 from evnlos.calibration.transport_fit import forward_jacobian, levenberg_marquardt
 from evnlos.cameras import EventPixel, PixelSettings
-from evnlos.data import read_capture
+from evnlos.config import load_yaml
+from evnlos.data import Simulation, read_capture
 from evnlos.data.pool import run_in_order
 from evnlos.errors import ConfigError
 from evnlos.inverse.event_images import (
@@ -43,7 +44,8 @@ from evnlos.inverse.event_images import (
 from evnlos.inverse.prior import PatternPrior
 from evnlos.inverse.sequence_statistic import EventStatistic
 from evnlos.machine import Progress, Step, note, silent
-from evnlos.types import Events
+from evnlos.setups import calibrated_file
+from evnlos.types import Events, target_side_m
 
 _LOG_NAMES = ("threshold_on", "threshold_off", "threshold_sigma", "shot_noise_rate_hz")
 _NAMES = (*_LOG_NAMES, "leak_rate_hz")
@@ -296,7 +298,7 @@ class _Solved:
     truth: NDArray[np.float32]
 
 
-def _solve(setup: str, folder: Path) -> _Solved | None:
+def _solve(setup: str, side_m: float, folder: Path) -> _Solved | None:
     """Solve the events of a capture; None where it has none, or its target or motion is not known.
 
     Raises:
@@ -306,7 +308,8 @@ def _solve(setup: str, folder: Path) -> _Solved | None:
     target = capture.target
     if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
         return None
-    statistic, prior, _ = event_statistic(capture.events, capture.frame_times_us, capture.motion, setup)
+    of = capture.events, capture.frame_times_us, capture.motion
+    statistic, prior, _ = event_statistic(*of, setup, side_m)
     return _Solved(capture.name, statistic, prior, target.rasterise(prior.target_plane))
 
 
@@ -338,10 +341,13 @@ def write_event_errors(
     learned = [folder for folder in captures if folder.resolve().name in names]
     learned = learned[:: max(1, -(-len(learned) // _MOST_CAPTURES))]
     (setup / EVENT_ERRORS_FILE).unlink(missing_ok=True)
+    if not learned:
+        return None
+    side_m = target_side_m(load_yaml(Simulation, calibrated_file(setup)).sampling.canvas)
     what, solved = "errors of the events", list[_Solved]()
     progress(Step(what, 0, len(learned), "captures"))
     try:
-        with closing(run_in_order(partial(_solve, str(setup)), learned, workers)) as found:
+        with closing(run_in_order(partial(_solve, str(setup), side_m), learned, workers)) as found:
             for done, one in enumerate(found, start=1):
                 solved += [one] if one else []
                 progress(Step(what, done, len(learned), "captures"))

@@ -25,6 +25,7 @@ from evnlos.calibration.wall_search import check_measured, fit_wall
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
 from evnlos.data.simulate import Simulation, ranges_around
+from evnlos.data.simulations import fitting
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import written_alike
 from evnlos.machine import Progress, Step, silent
@@ -282,8 +283,10 @@ def _simulation(
     assert isinstance(motion, LineMotion)  # the only motion that a capture describes
     x, y = motion.position_m(times[0])
     target_plane = replace(start.glyphs.target_plane, size_m=scene.target.size_m)
+    across, down = np.ptp(motion.position_m(times), axis=0)
     return replace(
         start,
+        sampling=fitting(start.sampling, scene.target.size_m, (float(across), float(down))),
         glyphs=replace(start.glyphs, target_plane=target_plane),
         motion=replace(motion, start_m=(float(x), float(y)), start_s=0.0),
         duration_s=float(times[-1] - times[0]),

@@ -26,6 +26,7 @@ from evnlos.machine import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs, LineMotion
 from evnlos.setups.load import page_setup
 from evnlos.setups.paper import as_in_the_paper, rough_paper
+from evnlos.types import target_side_m
 
 
 def default() -> Simulation:
@@ -361,3 +362,20 @@ def repair(
         for fault in faults:
             dataset.shard(fault.name).unlink(missing_ok=True)
     return simulate(config, dataset.folder, workers, progress=progress, force=force)
+
+
+def fitting(sampling: Sampling, size_m: float, travel_m: tuple[float, float]) -> Sampling:
+    """Return the sampling with a canvas for targets of another size, or on a longer way, than it is made for.
+
+    Targets of three fifths of its target plane or more, up to a sixteenth larger, keep it.
+
+    Args:
+        sampling: A sampling; its pitch changes.
+        size_m: Side of the targets, metres.
+        travel_m: Way of their centres across and down, metres.
+    """
+    side, rows_m = target_side_m(sampling.canvas), sampling.scored_rows * sampling.pitch_m
+    own = 1.0 if 0.6 <= size_m / side <= 1.0625 else size_m / side
+    needed = max((travel_m[0] + size_m) / (3 * side), (travel_m[1] + size_m) / rows_m)
+    scale = needed if needed > 1.04 * own else own
+    return sampling if scale == 1.0 else replace(sampling, pitch_m=round(scale * sampling.pitch_m, 6))

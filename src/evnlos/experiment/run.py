@@ -124,7 +124,6 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
     needs_setup = study.correct_pattern or any(arm.needs_setup for arm in study.arms)
     sees_events = any(as_modality(name).needs_events for name in study.modalities)
     arms = tuple(arm.with_light_path(setup, sees_events=sees_events) for arm in study.arms)
-    study = replace(study, arms=arms)
     if needs_setup and not calibrated_file(setup).is_file():
         settings = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test))
         progress(Step(f"calibrate {study.setup}", 0, 1, "setups"))
@@ -139,6 +138,10 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
+    if needs_setup:  # the canvas is that of its targets and their way
+        found, usual = load_yaml(Simulation, calibrated_file(setup)), study.calibration.start
+        arms = tuple(arm.enlarged(found.sampling.pitch_m / usual.sampling.pitch_m) for arm in arms)
+    study = replace(study, arms=arms)
     from evnlos.inverse import gains_by_errors  # which compiles
 
     networks = list[_Network]()
@@ -149,8 +152,8 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
             recorded += (_import(study, corrected, place, progress),)
         made = _simulate(study, arm, place, progress)
         for modality in study.modalities:
-            solves = as_modality(modality).needs_events
-            learned = (augmented(recorded[0], modality, progress),) if arm.augment else recorded[: 1 + solves]
+            learned = recorded[: 1 + as_modality(modality).needs_events]
+            learned = (augmented(recorded[0], modality, progress),) if arm.augment else learned
             plans = [_planned(study, arm, modality, seed, made, learned, place) for seed in study.seeds]
             networks.append(_Network(study, arm, modality, plans, made, recorded, place))
     return networks
@@ -304,8 +307,7 @@ def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset
     pattern = load_pattern(place.out / "setups" / study.setup) if study.correct_pattern else None
     seen: dict[str, Any] = {"captures": [f.name for f in chosen], "sampling": to_dict(arm.sampling)}
     seen |= {"test": list(held), "validation": list(study.validation), "pattern": pattern and pattern.digest}
-    key = config_hash(seen)
-    out = place.out / "recorded" / f"{study.setup}-{key[:8]}"
+    out = place.out / "recorded" / f"{study.setup}-{config_hash(seen)[:8]}"
     how = {"test": held, "validation": study.validation, "pattern": pattern, "workers": place.workers}
     return import_captures(chosen, out, arm.sampling, **how, progress=progress)
 

@@ -119,6 +119,10 @@ class Arm:
         seen = replace(self.sampling, setup=self.sampling.setup or str(setup))
         return replace(self, sampling=seen if sees_events else replace(seen, surface=Sampling().surface))
 
+    def enlarged(self, factor: float) -> Arm:
+        """Return the arm with a canvas that is larger by a factor."""
+        return replace(self, sampling=replace(self.sampling, pitch_m=self.sampling.pitch_m * factor))
+
 
 @dataclass(frozen=True)
 class Study:

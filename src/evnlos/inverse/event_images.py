@@ -31,10 +31,10 @@ from evnlos.inverse.prior import PatternPrior, ScoreErrors, handwritten_prior
 from evnlos.inverse.sequence_light import EVENT_PRIORS, sequence_light
 from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
 from evnlos.machine import note
-from evnlos.scene import LineMotion, Motion, Target, TargetPlane
+from evnlos.scene import LineMotion, Motion, Target
 from evnlos.setups import Setup, load_setup
 from evnlos.tensor_file import TensorFile
-from evnlos.types import Events, Plane
+from evnlos.types import Events, Plane, target_side_m
 
 CELLS, COEFFICIENTS = 32, 120
 """Cells along a side of the target, patterns of its prior."""
@@ -150,11 +150,11 @@ def gains_by_errors(setup: Path) -> bool:
 
 
 def event_statistic(
-    events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str
+    events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str, side_m: float
 ) -> tuple[EventStatistic, PatternPrior, NDArray[np.float64]]:
     """Return what all events of a sequence say of the target through a setup.
 
-    Arguments and errors as of `event_images`.
+    Arguments and errors as of `event_images`; `side_m` is the side of the target plane, metres.
 
     Returns:
         Information and score, the prior over targets that they are about, and where the target is at each edge
@@ -176,7 +176,7 @@ def event_statistic(
         motion, edges_us = replace(motion.in_its_plane(), start_s=0.0), edges_us - began_us
         events = replace(events, t_us=events.t_us - began_us)
     span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
-    solver, prior = _solver(setup, motion, span, (events.height, events.width))
+    solver, prior = _solver(setup, motion, span, (events.height, events.width), side_m)
     note("what the events say")
     with threadpool_limits(1):  # its products are small: a second thread mostly waits
         return solver(events), prior, motion.position_m(edges_us[1:] * 1e-6)
@@ -213,7 +213,7 @@ def event_images(
             f"{setup} has no {EVENT_ERRORS_FILE}, which the surface 'corrected' takes and `evnlos calibrate` "
             "writes where captures gain by it; give --sampling.surface likelihood"
         )
-    statistic, prior, places = event_statistic(events, edges_us, motion, setup)
+    statistic, prior, places = event_statistic(events, edges_us, motion, setup, target_side_m(canvas))
     if capture is not None:
         statistic = EVENT_ERRORS.load(path, "").corrected(statistic, capture)
     images = []
@@ -223,14 +223,19 @@ def event_images(
     return np.stack(images, axis=1)
 
 
-def event_prior(setup: Setup) -> PatternPrior:
-    """Return the prior over targets that events are solved with: letters as large as the setup's known ones."""
-    return handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS, ink=setup.ink)
+def event_prior(setup: Setup, side_m: float) -> PatternPrior:
+    """Return the prior over targets that events are solved with: letters as large as the setup's known ones.
+
+    Args:
+        setup: The setup.
+        side_m: Side of the target plane, metres.
+    """
+    return handwritten_prior(Plane(CELLS, CELLS, side_m / CELLS), COEFFICIENTS, ink=setup.ink)
 
 
 @lru_cache(maxsize=2)
 def _solver(
-    setup: str, motion: Motion, span_s: tuple[float, float], shape: tuple[int, int]
+    setup: str, motion: Motion, span_s: tuple[float, float], shape: tuple[int, int], side_m: float
 ) -> tuple[EventSolver, PatternPrior]:
     """Return the solver of a setup, and its prior: letters as large as the known targets' or the usual one."""
     try:
@@ -241,7 +246,7 @@ def _solver(
             "folder of `evnlos calibrate` that the samples were made with, from where its name leads to it, or "
             "put a folder `near` beside weights `near-....safetensors`"
         ) from None
-    prior = event_prior(known)
+    prior = event_prior(known, side_m)
     note("light path of the events")
     light = sequence_light(known.seen_by(shape), prior, motion.position_m, span_s, shape)
     law = known.pixel.crossing_law(light.typical_dn)

@@ -17,24 +17,27 @@ from torch import Tensor
 from evnlos.data import NlosDataset
 from evnlos.errors import DataError
 from evnlos.models.reconstructor import Reconstructor
-from evnlos.types import Plane, derive_seed
+from evnlos.types import Plane, derive_seed, target_side_m
 
 SIDE = 32
 """Side of a target plane's image, pixels."""
 
 
-def on_target_plane(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
+def on_target_plane(
+    images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float | None = None
+) -> Tensor:
     """Return the part of each image that shows the target, resampled to 32 x 32.
 
     Args:
         images: Images of the canvas, float [N, H, W].
         canvas: Their geometry.
         position_m: Centre (x, y) of the target in each image, [N, 2], metres.
-        size_m: Side of the target plane, metres.
+        size_m: Side of the target plane, metres; None: that which the canvas is made for.
 
     Returns:
         float32 [N, 1, 32, 32]; zero outside the canvas.
     """
+    size_m = target_side_m(canvas) if size_m is None else size_m
     centre = torch.as_tensor(np.asarray(position_m), dtype=torch.float32)  # [N, 2]
     span = torch.tensor([canvas.width, canvas.height]) * (canvas.pitch_m / 2)
     ticks = (torch.arange(SIDE) + 0.5) / SIDE * size_m - size_m / 2
@@ -44,7 +47,7 @@ def on_target_plane(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m
     return F.grid_sample(images[:, None].float(), points / span, align_corners=False)
 
 
-def on_canvas(target: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
+def on_canvas(target: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float | None = None) -> Tensor:
     """Return images of the canvas that show one target at each position; `on_target_plane` takes it out
     again.
 
@@ -52,11 +55,12 @@ def on_canvas(target: Tensor, canvas: Plane, position_m: ArrayLike, size_m: floa
         target: Image of the target, float [P, P].
         canvas: Geometry of the images.
         position_m: Centre (x, y) of the target in each image, [N, 2], metres.
-        size_m: Side of the target plane, metres.
+        size_m: Side of the target plane, metres; None: that which the canvas is made for.
 
     Returns:
         float32 [N, H, W]; zero beside the target plane.
     """
+    size_m = target_side_m(canvas) if size_m is None else size_m
     centre = torch.as_tensor(position_m, dtype=torch.float32, device=target.device)
     y, x = (torch.from_numpy(at).float().to(target.device) for at in (canvas.y_m, canvas.x_m))
     place = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)  # [H, W, 2]

@@ -33,10 +33,10 @@ from evnlos.models.confidence import on_canvas
 from evnlos.scene import Glyphs, HandwritingGlyphs
 from evnlos.setups import TRAINING_FILE, load_setup
 from evnlos.tensor_file import TensorFile
-from evnlos.types import Plane
+from evnlos.types import Plane, target_side_m
 
-PLANE_M = 0.1
-"""Side of the square around the target plane's centre that is drawn, metres: 8 cm and a margin."""
+_MARGIN = 1.25
+"""Side of the square that is drawn over that of the target plane in its middle."""
 
 FINER = 2
 """Pixels of that square per pixel of the canvas: positions between pixels tell more than one of them does."""
@@ -52,15 +52,15 @@ class TargetGrid:
         sampling: Size of the maps and their pitch on the target's canvas.
 
     Raises:
-        ConfigError: The pitch is too fine for the square of 10 cm.
+        ConfigError: The canvas has too many pixels.
     """
 
     def __init__(self, sampling: Sampling) -> None:
         self.pitch_m = pitch_m = sampling.pitch_m / FINER
-        self.side = max(1, round(PLANE_M / pitch_m / _CELLS)) * _CELLS
+        self.side = max(1, round(_MARGIN * target_side_m(sampling.canvas) / pitch_m / _CELLS)) * _CELLS
         if self.side > _MOST_PIXELS:
             raise ConfigError(
-                f"Sampling.pitch_m is {sampling.pitch_m}; a sequence network takes {PLANE_M / 2000:g} m or more"
+                f"Sampling.width is {sampling.width}; a sequence network takes {_MOST_PIXELS} pixels or less"
             )
         # On the CPU wherever the layers are: the first arithmetic on the device "meta" imports for seconds.
         across = (torch.arange(self.side, device="cpu") + 0.5 - self.side / 2) * pitch_m
@@ -337,7 +337,7 @@ class DrawnEvents:
                 "calibrate again, or leave --drawn at 0"
             )
         known = EVENT_ERRORS.load(path, "")
-        self._prior = event_prior(load_setup(sampling.setup))
+        self._prior = event_prior(load_setup(sampling.setup), target_side_m(sampling.canvas))
         self._grid, self._scale = grid, scale
         a = known.information.double().numpy()
         self._errors = ScoreErrors.of(known.scores.double().numpy(), a, 1.0)

@@ -38,9 +38,8 @@ from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmb
 from evnlos.models.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor
 from evnlos.models.unet import PARTS, PooledScale, ResidualUNet, UNetConfig
 from evnlos.optics import MatrixTransport
-from evnlos.scene import TargetPlane
 from evnlos.setups import Setup, load_setup
-from evnlos.types import Plane, derive_seed
+from evnlos.types import Plane, derive_seed, target_side_m
 
 
 @RECONSTRUCTORS.register
@@ -124,7 +123,7 @@ class PooledFrames(nn.Module):
     def __init__(self, sampling: Sampling, prior_weights: tuple[float, ...], rank: int) -> None:
         super().__init__()
         self.sampling, self.weights = sampling, prior_weights
-        self.target_plane = Plane(_CELLS_ACROSS, _CELLS_ACROSS, TargetPlane().size_m / _CELLS_ACROSS)
+        self.target_plane = Plane(_CELLS_ACROSS, _CELLS_ACROSS, target_side_m(sampling.canvas) / _CELLS_ACROSS)
         height, width = sampling.height, sampling.width
         rank = min(rank, height * width)
         self.register_buffer("ambient", torch.zeros(height, width))
@@ -369,7 +368,7 @@ class SequenceReconstructor(Reconstructor):
         sampling: Size of the maps and their pitch on the target's canvas.
 
     Raises:
-        ConfigError: The pitch is too fine for the square of 10 cm that is drawn.
+        ConfigError: The canvas has too many pixels.
     """
 
     sees_sequence = True
