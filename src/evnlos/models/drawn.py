@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,9 +31,9 @@ from evnlos.inverse.sequence_light import EVENT_PRIORS
 from evnlos.inverse.sequence_statistic import EventStatistic
 from evnlos.machine import note
 from evnlos.models.confidence import on_canvas
-from evnlos.scene import Glyphs, HandwritingGlyphs
+from evnlos.scene import TRAIN_WRITERS, Glyphs, HandwritingGlyphs
 from evnlos.setups import TRAINING_FILE, load_setup
-from evnlos.tensor_file import TensorFile
+from evnlos.tensor_file import TensorFile, file_checksum
 from evnlos.types import Plane, target_side_m
 
 _MARGIN = 1.25
@@ -120,10 +121,9 @@ DRAWN_FILE = "drawn.safetensors"
 """Targets that were drawn for the training behind a setup, in its folder."""
 
 _DRAWN = 1024  # targets: more take long to draw, and what is bent anew is as good as new
-_SIDE, _AT_ONCE = 64, 32  # pixels of one; drawn at a time
+_SIDE, _AT_ONCE, _COUNT = 64, 32, 8  # pixels of one; drawn at a time; subsets of the time steps
 _TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.08, 0.07, 0.05, 0.12, 0.015, 0.03
 _WAVES = 5  # knots along a side of the field that bends
-_COUNT = 8  # subsets of the time steps
 
 
 @dataclass(frozen=True)
@@ -175,25 +175,28 @@ def drawn_targets(setup: str | Path, workers: int = 1) -> DrawnTargets:
             "with --sampling.setup FOLDER of `evnlos calibrate`, or leave --drawn at 0"
         )
     simulation = load_yaml(Simulation, folder / TRAINING_FILE)
-    glyphs = simulation.glyphs
+    glyphs, images = simulation.glyphs, list[str]()
     if isinstance(glyphs, HandwritingGlyphs):
-        known = len(glyphs.objects()) - len(replace(glyphs, redrawn=0).objects()) if glyphs.redrawn else 0
-        known //= max(glyphs.redrawn, 1)
-        half = _DRAWN // 2 if known else _DRAWN
-        again = math.ceil(half / known) if known else 0
-        glyphs = replace(glyphs, writers=math.ceil(half / len(glyphs.characters)), redrawn=again)
-    key, path = config_hash(to_dict(glyphs) | {"seed": simulation.seed}), folder / DRAWN_FILE
+        shown = sorted(Path(glyphs.known).glob("*.png")) if glyphs.redrawn else []
+        half = _DRAWN // 2 if shown else _DRAWN
+        again = math.ceil(half / len(shown)) if shown else 0
+        writers = min(math.ceil(half / len(glyphs.characters)), max(1, TRAIN_WRITERS - glyphs.first_writer))
+        glyphs = replace(glyphs, writers=writers, redrawn=again)
+        images = [file_checksum(one) for one in shown]
+    key = config_hash(to_dict(glyphs) | {"seed": simulation.seed, "images": images})
+    path = folder / DRAWN_FILE
     if path.is_file():
         found = DRAWN.load(path, "")
         if found.about.glyphs == key:
             return found
     note("draw targets")
-    names = glyphs.objects()[:_DRAWN]
+    names = glyphs.objects()
     tasks = [names[k : k + _AT_ONCE] for k in range(0, len(names), _AT_ONCE)]
     parts = run_in_order(partial(_drawn, glyphs, simulation.seed), tasks, workers)
     masks, sizes = zip(*(pair for part in parts for pair in part), strict=True)
     found = DrawnTargets(AboutDrawn(key, float(sizes[0])), torch.from_numpy(np.stack(masks)).half())
-    DRAWN.write(path, {"masks": found.masks}, found.about)
+    with suppress(OSError):  # where nothing can be kept they are drawn anew each time
+        DRAWN.write(path, {"masks": found.masks}, found.about)
     return found
 
 
