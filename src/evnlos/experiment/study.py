@@ -15,7 +15,7 @@ import numpy as np
 from evnlos.analysis import Evaluation, Scores
 from evnlos.calibration import Calibration
 from evnlos.config import to_dict
-from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation
+from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation, as_modality
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, Step
@@ -94,13 +94,14 @@ class Arm:
         return name if given == own else None
 
     def first_training(self, modality: str) -> Training:
-        """Return the settings of the pre-training of the network that sees a modality.
-
-        Args:
-            modality: What the network sees.
-        """
+        """Return the settings of the pre-training of the network that sees a modality."""
         assert self.pretraining is not None
         return self.pretraining if self.anew is None or self.layers(modality) else self.anew
+
+    def last_training(self, modality: str) -> Training:
+        """Return the settings of the fine-tuning of the network that sees a modality."""
+        assert self.finetuning is not None  # captures alone tell more of events than sequences drawn beside them
+        return replace(self.finetuning, drawn=self.finetuning.drawn * as_modality(modality).needs_frames)
 
     @property
     def needs_setup(self) -> bool:
@@ -108,7 +109,7 @@ class Arm:
         return self.source == "calibrated" or self.sampling.is_solved
 
     def with_light_path(self, setup: Path, *, sees_events: bool = True) -> Arm:
-        """Return the arm with a setup for the surface `likelihood`, where it is made and names none.
+        """Return the arm with a setup, where it names none, for the surface `likelihood`.
 
         Args:
             setup: Folder of the calibrated setup.
@@ -131,7 +132,7 @@ class Study:
     name: str
     """Name of the experiment."""
     setup: str = "near"
-    """Name of the setup; the calibrated setup and all that follows from it are kept under this name."""
+    """Name of the setup, under which the calibrated one and all that follows from it are kept."""
     arms: tuple[Arm, ...] = ()
     """What is compared."""
     modalities: tuple[str, ...] = STANDARD_MODALITIES

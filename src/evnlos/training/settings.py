@@ -111,8 +111,8 @@ class Training:
     """Samples of each sequence, for networks that see it whole: all time steps, every other, random ones."""
     drawn: int = 0
     """Sequences of newly drawn targets an epoch, made in closed form and never twice the same: of a network of
-    whole sequences that sees frames and events solved through a calibrated setup. A pre-training learns from
-    them alone; the samples tell it light path and scale."""
+    whole sequences that sees frames and events solved through a calibrated setup. A pre-training
+    learns from them alone; the samples tell it light path and scale."""
     mirror: bool = False
     """Show half of the samples of each epoch upside down, input and image: further captures at no cost where
     the setup is symmetric about the height of the target; for networks that see single time steps."""

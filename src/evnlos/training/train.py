@@ -192,11 +192,12 @@ def _epochs(
         done, log = load_checkpoint(checkpoint, network, optimiser, key)
     begins = is_new and not done
     source: BatchSource | DrawnSource = steps
-    if not (settings.drawn and is_new):
+    alone = is_new and settings.drawn > 0
+    if not alone:
         source = steps.for_network(network, settings.sequence_augmentations, is_new=begins)
     if settings.drawn:
         assert samples is not None
-        shown = source.samples if isinstance(source, DiskSource) and not is_new else None
+        shown = source.samples if isinstance(source, DiskSource) and not alone else None
         drawn = cast(SequenceReconstructor, network).drawn_sequences(samples, known, seed, is_new=begins)
         source = DrawnSource(drawn, settings.drawn, shown, *how)
     if goes_on and not is_new:  # its samples were those of the weights that it began with
