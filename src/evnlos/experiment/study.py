@@ -100,7 +100,8 @@ class Arm:
 
     def last_training(self, modality: str) -> Training:
         """Return the settings of the fine-tuning of the network that sees a modality."""
-        assert self.finetuning is not None  # captures alone tell more of events than sequences drawn beside them
+        assert self.finetuning is not None
+        # Captures alone tell more of events than with sequences drawn beside them.
         return replace(self.finetuning, drawn=self.finetuning.drawn * as_modality(modality).needs_frames)
 
     @property
