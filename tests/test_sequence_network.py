@@ -36,7 +36,7 @@ from evnlos.models import (
     load_weights,
     on_target_plane,
 )
-from evnlos.models.drawn import DRAWN, DrawnEvents, subsets
+from evnlos.models.drawn import DRAWN, DrawnEvents, DrawnFrames, KnownSequence, TargetGrid, subsets
 from evnlos.models.sequence import PooledFrames
 from evnlos.optics import MatrixTransport
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, Target
@@ -309,6 +309,27 @@ def test_scores_of_drawn_targets_are_those_of_their_frames() -> None:
     found = (seen @ target.flatten()).double() + base + solver.errors(frames, truth, places, kept)
     images = torch.cat([solver.solved(information[k : k + 1], found[k : k + 1]) for k in range(4)])
     torch.testing.assert_close(images, solver(frames, places, kept), rtol=1e-3, atol=1e-3)
+
+
+def test_known_sequences_of_other_lengths_and_ways_tell_errors_too() -> None:
+    """The way of new targets is that of a sequence, not a mean of ways there and back."""
+    torch.manual_seed(0)
+    sampling = Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20)
+    solver, asked = PooledFrames(sampling, (0.5,), 40), list[torch.Tensor]()
+    for buffer in solver.buffers():
+        buffer.copy_(0.1 * torch.randn_like(buffer))
+    solver.static.abs_()
+    foreseen = solver.foreseen
+    solver.foreseen = lambda *args: (asked.append(args[1]), foreseen(*args))[1]
+    known = list[KnownSequence]()
+    for steps, sign in ((9, 1.0), (8, -1.0), (8, 1.0), (9, -1.0), (8, 1.0), *6 * ((8, 1.0),), (3, 1.0)):
+        way = sign * torch.linspace(-0.05, 0.05, steps)[:, None] * torch.tensor([1.0, 0.1])
+        known.append(KnownSequence(torch.rand(steps, 24, 36), torch.rand(steps, 24, 36), way, solver))
+    frames = DrawnFrames(solver, known, TargetGrid(sampling))
+    assert frames.kept.shape == (8, 8) and torch.equal(asked[0], known[2].position_m)
+    side = TargetGrid(sampling).side
+    images = frames(torch.rand(2, side, side), torch.Generator().manual_seed(0))
+    assert images.shape == (2, 1, side, side) and torch.isfinite(images).all()
 
 
 def test_errors_of_scores_are_told_from_noise_and_drawn_again() -> None:

@@ -211,7 +211,7 @@ def event_images(
     if capture is not None and not path.is_file():
         raise DataError(
             f"{setup} has no {EVENT_ERRORS_FILE}, which the surface 'corrected' takes and `evnlos calibrate` "
-            "writes where captures gain by it; give --sampling.surface likelihood"
+            "writes where it fits events; give --sampling.surface likelihood"
         )
     statistic, prior, places = event_statistic(events, edges_us, motion, setup, target_side_m(canvas))
     if capture is not None:

@@ -285,7 +285,7 @@ class ScoreErrors:
             free = min(number - 1, count)
             least = float(np.linalg.eigvalsh(rest.T @ rest)[number - free]) / max(number - 1, count)
             share = free / max(number - 1, count)
-            noise = float(min(least / max(1.0 - math.sqrt(share), 0.1) ** 2, total / count))
+            noise = float(min(max(least, 0.0) / max(1.0 - math.sqrt(share), 0.1) ** 2, total / count))
         mean *= max(0.0, 1.0 - total / number / max(float(mean @ mean), 1e-12))
         rest *= np.sqrt(max(0.0, 1.0 - count * noise / max(total, 1e-12)) / (number - 1))
         return cls(root @ mean, root @ rest, root * math.sqrt(noise))

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -35,6 +35,9 @@ from evnlos.scene import TRAIN_WRITERS, Glyphs, HandwritingGlyphs
 from evnlos.setups import TRAINING_FILE, load_setup
 from evnlos.tensor_file import TensorFile, file_checksum
 from evnlos.types import Plane, target_side_m
+
+if TYPE_CHECKING:
+    from evnlos.models.sequence import PooledFrames
 
 _MARGIN = 1.25
 """Side of the square that is drawn over that of the target plane in its middle."""
@@ -234,24 +237,6 @@ def bent(planes: Tensor, generator: torch.Generator) -> Tensor:
     return F.grid_sample(planes[:, None], grid, align_corners=False)[:, 0].clamp(0, 1)
 
 
-class FrameSolver(Protocol):
-    """What frames are solved with: `PooledFrames`."""
-
-    target_plane: Plane
-
-    def errors(self, frames: Tensor, truth: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
-        """Return by how much the scores of a known target miss, [K, k]."""
-        ...
-
-    def foreseen(self, plane: Plane, position_m: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return M [K, k, cells], b [K, k] and information: the score of a target x is M x + b."""
-        ...
-
-    def solved(self, information: Tensor, score: Tensor) -> Tensor:
-        """Return the targets of each weight of the prior, [K, S, h, h]."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class KnownSequence:
     """A sequence of a known target: frames and truth [N, H, W], places [N, 2], and what solves its frames.
@@ -262,7 +247,7 @@ class KnownSequence:
     frames: Tensor
     truth: Tensor
     position_m: Tensor
-    solver: FrameSolver
+    solver: PooledFrames
 
 
 def subsets(steps: int, count: int = _COUNT) -> Tensor:
@@ -289,19 +274,24 @@ class DrawnFrames:
 
     Args:
         solver: What they are solved with.
-        known: Sequences of known targets; those with as many time steps as most tell the errors.
+        known: Sequences of known targets, cut to as many time steps as nine in ten have; shorter ones tell
+            nothing. New targets go the way that is nearest to all of theirs.
         grid: The square that is drawn.
     """
 
-    def __init__(self, solver: FrameSolver, known: Sequence[KnownSequence], grid: TargetGrid) -> None:
-        lengths = [len(one.frames) for one in known]
-        usual = max(set(lengths), key=lengths.count)
-        alike = [one for one in known if len(one.frames) == usual]
-        self._solver, self._grid, self.kept = solver, grid, subsets(usual)
-        places = torch.stack([one.position_m for one in alike]).median(dim=0).values
+    def __init__(self, solver: PooledFrames, known: Sequence[KnownSequence], grid: TargetGrid) -> None:
+        steps = sorted(len(one.frames) for one in known)[len(known) // 10]
+        alike = [one for one in known if len(one.frames) >= steps]
+        self._solver, self._grid, self.kept = solver, grid, subsets(steps)
+        ways = torch.stack([one.position_m[:steps] for one in alike])
+        apart = torch.cdist(ways.flatten(1).double(), ways.flatten(1).double()).sum(dim=1)
+        places = ways[int(apart.argmin())]
         cells = Plane(grid.side // FINER, grid.side // FINER, grid.pitch_m * FINER)
         self._seen, self._base, self._information = solver.foreseen(cells, places, self.kept)
-        missed = [one.solver.errors(one.frames, one.truth, one.position_m, self.kept) for one in alike]
+        missed = [
+            one.solver.errors(one.frames[:steps], one.truth[:steps], way, self.kept)
+            for one, way in zip(alike, ways, strict=True)
+        ]
         scores = torch.stack(missed, dim=1).numpy()  # [K, C, k]
         self._errors = [
             ScoreErrors.of(mine, own.numpy()) for mine, own in zip(scores, self._information, strict=True)
