@@ -74,7 +74,7 @@ def test_a_scene_is_named_and_takes_nothing_beside_its_folder(tmp_path, capsys):
     with pytest.raises(UnknownNameError, match=f"give one of {', '.join(NAMES)}"):
         Demo(scene="moon")
     with pytest.raises(ConfigError, match="takes `out` alone"):
-        Demo(scene=NAMES[0], writers=2)
+        Demo(scene=NAMES[0], writers=3)
     with pytest.raises(SystemExit):
         main(["demo", "--scene", "moon", "--out", str(tmp_path / "x")])
     assert "moon" in capsys.readouterr().err and not (tmp_path / "x").exists()

