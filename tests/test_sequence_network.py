@@ -247,14 +247,20 @@ def test_what_a_joint_network_cannot_do_is_said(trained, tiny_dataset) -> None:
 SOLVING = replace(NET, rank=200, frames="likelihood", prior_weights=(0.3, 3.0))
 
 
-def test_frames_are_solved_as_one_gaussian_posterior() -> None:
-    """Against all rows of all frames at once, with offset and noise in a dense covariance."""
+def random_solver(rank: int) -> PooledFrames:
+    """A solver of frames with random numbers for everything that it would take from samples."""
     torch.manual_seed(0)
-    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0), 200)
+    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0), rank)
     for name, buffer in solver.named_buffers():
         buffer.copy_(torch.randn_like(buffer) * {"basis": 0.3, "patterns": 0.3}.get(name, 0.1))
     solver.static.copy_(2.0 * torch.rand(len(solver.static)))
     solver.reach.copy_(torch.tensor([[-0.06, -0.01], [0.06, 0.01]]))
+    return solver
+
+
+def test_frames_are_solved_as_one_gaussian_posterior() -> None:
+    """Against all rows of all frames at once, with offset and noise in a dense covariance."""
+    solver = random_solver(200)
     places = torch.stack([torch.linspace(-0.05, 0.05, 5), 0.1 * torch.linspace(-0.05, 0.05, 5)], dim=1)
     frames, kept = torch.rand(5, 24, 36), torch.tensor([[1.0, 1, 1, 1, 1], [1, 0, 1, 0, 0]])
     white = torch.eye(200, dtype=torch.float64) + 0.03 * torch.randn(200, 200, dtype=torch.float64)
@@ -292,14 +298,9 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
 
 def test_scores_of_drawn_targets_are_those_of_their_frames() -> None:
     """M x + b and what is missed beside it is the score of the frames, whatever these are."""
-    torch.manual_seed(0)
-    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0), 40)
-    for name, buffer in solver.named_buffers():
-        buffer.copy_(torch.randn_like(buffer) * {"basis": 0.3, "patterns": 0.3}.get(name, 0.1))
-    solver.static.copy_(2.0 * torch.rand(len(solver.static)))
-    solver.reach.copy_(torch.tensor([[-0.06, -0.01], [0.06, 0.01]]))
+    solver = random_solver(40)
     places = torch.stack([torch.linspace(-0.05, 0.05, 5), 0.1 * torch.linspace(-0.05, 0.05, 5)], dim=1)
-    cells, frames, kept = Plane(9, 9, 0.01), torch.rand(5, 24, 36), subsets(5, 4)
+    cells, frames, kept = Plane(9, 9, 0.01), torch.rand(5, 24, 36), subsets(5, 4, np.random.default_rng(0))
     target = torch.rand(9, 9)
     carrier = MatrixTransport(solver.light.flatten(1), solver.sampling.canvas, (1, 40))
     truth = SequenceOperator(carrier, cells, places.double().numpy()).drawn(target.double()).float()
@@ -311,23 +312,18 @@ def test_scores_of_drawn_targets_are_those_of_their_frames() -> None:
 
 def test_known_sequences_of_other_lengths_and_ways_tell_errors_too() -> None:
     """The way of new targets is that of a sequence, not a mean of ways there and back."""
-    torch.manual_seed(0)
-    sampling = Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20)
-    solver, asked = PooledFrames(sampling, (0.5,), 40), list[torch.Tensor]()
-    for buffer in solver.buffers():
-        buffer.copy_(0.1 * torch.randn_like(buffer))
-    solver.static.abs_()
+    solver, asked = random_solver(40), list[torch.Tensor]()
+    grid = TargetGrid(solver.sampling)
     foreseen = solver.foreseen
     solver.foreseen = lambda *args: (asked.append(args[1]), foreseen(*args))[1]
     known = list[KnownSequence]()
     for steps, sign in ((9, 1.0), (8, -1.0), (8, 1.0), (9, -1.0), (8, 1.0), *6 * ((8, 1.0),), (3, 1.0)):
         way = sign * torch.linspace(-0.05, 0.05, steps)[:, None] * torch.tensor([1.0, 0.1])
         known.append(KnownSequence(torch.rand(steps, 24, 36), torch.rand(steps, 24, 36), way, solver))
-    frames = DrawnFrames(solver, known, TargetGrid(sampling))
+    frames = DrawnFrames(solver, known, grid)
     assert frames.kept.shape == (8, 8) and torch.equal(asked[0], known[2].position_m)
-    side = TargetGrid(sampling).side
-    images = frames(torch.rand(2, side, side), torch.Generator().manual_seed(0))
-    assert images.shape == (2, 1, side, side) and torch.isfinite(images).all()
+    images = frames(torch.rand(2, grid.side, grid.side), torch.Generator().manual_seed(0))
+    assert images.shape == (2, 2, grid.side, grid.side) and torch.isfinite(images).all()
 
 
 def test_errors_of_scores_are_told_from_noise_and_drawn_again() -> None:

@@ -64,7 +64,7 @@ class Demo:
     """Setup of installed weights whose layers the pre-training begins with; empty: random ones."""
     drawn: int = 2272
     """Sequences of newly drawn targets in an epoch of the pre-training, made in closed form behind the
-    calibrated setup, and fourteen times as many as beside the captures; 0: learn from rendered sequences."""
+    calibrated setup; a fine-tuning sees a fourteenth beside the captures. 0: learn from rendered sequences."""
     pretrain_epochs: int | None = None
     """Epochs on the simulated sequences; by default 4 from trained layers, 8 from random ones."""
     finetune_epochs: int = 20
@@ -264,13 +264,13 @@ def _study(settings: Demo, test: list[str], events: bool) -> Study:
     solving = replace(network, frames="likelihood") if settings.calibrate else network
     plan = Training(batch_size=16, network=solving)
     made = settings.drawn if settings.calibrate and not settings.robust else 0
-    anew = replace(plan, epochs=settings.pretrain_epochs or 8, sequence_augmentations=2, drawn=made)
-    before = anew
+    before = anew = replace(plan, epochs=settings.pretrain_epochs or 8, sequence_augmentations=2, drawn=made)
     if settings.start:  # trained layers need less time and smaller steps; validation characters chose both
         before = replace(anew, epochs=settings.pretrain_epochs or 4, learning_rate=1e-3, refit_embedding=True)
-    # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
-    after = replace(plan, epochs=settings.finetune_epochs, learning_rate=5e-4, keep_normalization=True)
-    after = replace(after, drawn=made // 14)
+    # Gentle, so that it forgets little. Captures held out of it choose how much of it is taken, if any, unless
+    # the pre-training has drawn their targets again and learned their errors: then they would choose none.
+    after = replace(plan, epochs=settings.finetune_epochs, learning_rate=5e-4, drawn=made // 14)
+    after = replace(after, keep_normalization=True)
     source = "calibrated" if settings.calibrate else "uncalibrated"
     drawn = ROBUST if settings.robust else ""
     alone_sees = Sampling(surface="hots", radius=1)  # of the time surfaces, validation characters chose it

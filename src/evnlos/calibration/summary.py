@@ -296,14 +296,14 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
         fit: The calibration.
         rows: Its numbers (see `rows_of`).
         out: Folder; made where it is missing.
-        force: Write the setup file although the fit is no better on the held-out captures, or one exists.
+        force: Write the setup file although the frames fit no better on the held-out captures, or one exists.
 
     Returns:
         The setup file, which `evnlos simulate --config` takes.
 
     Raises:
-        DataError: The fit is no better than the start on the held-out captures, or, with unknown targets,
-            leaves them far above the noise.
+        DataError: Frames of held-out captures fit no better than at the start, or, with unknown targets, are
+            left far above the noise. Where events alone fit no better the setup is written, and warns.
     """
     check_out(out, force)
     out.mkdir(parents=True, exist_ok=True)

@@ -151,6 +151,8 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
             corrected = replace(arm, sampling=replace(arm.sampling, surface="corrected"))
             recorded += (_import(study, corrected, place, progress),)
         made = _simulate(study, arm, place, progress)
+        if arm.pretraining and arm.pretraining.drawn:  # before several trainings want them
+            drawn_targets(arm.sampling.setup, place.workers)
         for modality in study.modalities:
             learned = recorded[: 1 + as_modality(modality).needs_events]
             learned = (augmented(recorded[0], modality, progress),) if arm.augment else learned
@@ -340,7 +342,6 @@ def _planned(
         settings = replace(arm.first_training(modality), modality=modality, seed=seed)
         decides: dict[str, Any] = {"data": made.config_hash, "settings": to_dict(settings)}
         if settings.drawn:
-            drawn_targets(made.sampling.setup, place.workers)  # before several want them
             decides["errors of"] = recorded[0].folder.name
         if begin is not None:
             decides["from"] = arm.start

@@ -189,12 +189,13 @@ class PatternPrior:
         return self.patterns.shape[1]
 
     def coefficients(self, image: Array | Single) -> Array:
-        """Return the coefficients of a target [h, w], [k]: the patterns are orthogonal."""
-        return (image.ravel() - self.mean) @ (self.patterns / np.square(self.patterns).sum(axis=0))
+        """Return the coefficients of targets [..., h, w], [..., k]: the patterns are orthogonal."""
+        cells = image.reshape(*image.shape[:-2], -1)
+        return (cells - self.mean) @ (self.patterns / np.square(self.patterns).sum(axis=0))
 
     def image(self, z: Array) -> Array:
-        """Return the target of coefficients [k], [h, w]."""
-        return (self.mean + self.patterns @ z).reshape(self.target_plane.shape)
+        """Return the targets of coefficients [..., k], [..., h, w]."""
+        return (self.mean + z @ self.patterns.T).reshape(*z.shape[:-1], *self.target_plane.shape)
 
     def variance(self, covariance: Array) -> Array:
         """Return the variance of each cell [h, w] at a covariance [k, k] of the coefficients, rest included."""

@@ -56,15 +56,16 @@ class TargetGrid:
         sampling: Size of the maps and their pitch on the target's canvas.
 
     Raises:
-        ConfigError: The canvas has too many pixels.
+        ConfigError: The pitch is too fine for the square that is drawn.
     """
 
     def __init__(self, sampling: Sampling) -> None:
         self.pitch_m = pitch_m = sampling.pitch_m / FINER
         self.side = max(1, round(_MARGIN * target_side_m(sampling.canvas) / pitch_m / _CELLS)) * _CELLS
         if self.side > _MOST_PIXELS:
+            least_m = sampling.pitch_m * self.side / _MOST_PIXELS
             raise ConfigError(
-                f"Sampling.width is {sampling.width}; a sequence network takes {_MOST_PIXELS} pixels or less"
+                f"Sampling.pitch_m is {sampling.pitch_m}; a sequence network takes {least_m:.1g} m or more here"
             )
         # On the CPU wherever the layers are: the first arithmetic on the device "meta" imports for seconds.
         across = (torch.arange(self.side, device="cpu") + 0.5 - self.side / 2) * pitch_m
@@ -250,23 +251,22 @@ class KnownSequence:
     solver: PooledFrames
 
 
-def subsets(steps: int, count: int = _COUNT) -> Tensor:
-    """Return subsets of the time steps, [K, N]: all, every other, then at least a quarter at random."""
-    draw = np.random.default_rng(0)
+def subsets(steps: int, count: int, draw: np.random.Generator) -> Tensor:
+    """Return subsets of the time steps, [K, N]: all, every other, then at least a quarter at random.
+
+    Args:
+        steps: N.
+        count: K.
+        draw: Draws those at random.
+    """
     kept = torch.zeros(count, steps)
     for number in range(count):
-        kept[number, subset(number, steps, draw)] = 1
+        chosen: NDArray[np.int64] | slice = slice(0, None, 1 + (number == 1))
+        if number > 1 and steps > 1:
+            few = int(draw.integers(max(1, steps // 4), steps + 1))
+            chosen = draw.permutation(steps)[:few]
+        kept[number, chosen] = 1
     return kept
-
-
-def subset(number: int, steps: int, draw: np.random.Generator) -> NDArray[np.int64]:
-    """Return the time steps of subset `number`: 0 all, 1 every other, then at least a quarter at random."""
-    if number == 0 or steps == 1:
-        return np.arange(steps)
-    if number == 1:
-        return np.arange(0, steps, 2)
-    chosen = int(draw.integers(max(1, steps // 4), steps + 1))
-    return np.sort(draw.permutation(steps)[:chosen])
 
 
 class DrawnFrames:
@@ -282,7 +282,8 @@ class DrawnFrames:
     def __init__(self, solver: PooledFrames, known: Sequence[KnownSequence], grid: TargetGrid) -> None:
         steps = sorted(len(one.frames) for one in known)[len(known) // 10]
         alike = [one for one in known if len(one.frames) >= steps]
-        self._solver, self._grid, self.kept = solver, grid, subsets(steps)
+        self._solver, self._grid = solver, grid
+        self.kept = subsets(steps, _COUNT, np.random.default_rng(0))
         ways = torch.stack([one.position_m[:steps] for one in alike])
         apart = torch.cdist(ways.flatten(1).double(), ways.flatten(1).double()).sum(dim=1)
         places = ways[int(apart.argmin())]
@@ -333,17 +334,13 @@ class DrawnEvents:
         self._prior = event_prior(load_setup(sampling.setup), target_side_m(sampling.canvas))
         self._grid, self._scale = grid, scale
         a = known.information.double().numpy()
-        self._errors = ScoreErrors.of(known.scores.double().numpy(), a, 1.0)
-        corrects = sampling.surface == "corrected"
-
-        def solved(score: NDArray[np.float64]) -> NDArray[np.float64]:
-            statistic = EventStatistic(np.zeros(len(a)), a, score)
-            return (counted(statistic, self._errors) if corrects else statistic).solutions(EVENT_PRIORS)
-
-        # Solving is linear in the score: its matrix [n, k, k] and what it makes of none.
-        self._none = torch.from_numpy(solved(np.zeros(len(a))))
-        each = torch.from_numpy(np.stack([solved(one) for one in np.eye(len(a))], axis=-1))
-        self._back, self._information = each - self._none[..., None], torch.from_numpy(a)
+        errors = ScoreErrors.of(known.scores.double().numpy(), a, 1.0)
+        told = EventStatistic(np.zeros(len(a)), a, np.eye(len(a)))  # of each score alone: solving is linear
+        if sampling.surface == "corrected":  # which has lost what all share
+            errors = replace(errors, mean=np.zeros(len(a)))
+            told = counted(told, errors)
+        self._errors, self._information = errors, torch.from_numpy(a)
+        self._back = torch.from_numpy(told.solutions(EVENT_PRIORS))  # [n, k, k]
         spot = torch.zeros(grid.side, grid.side)
         spot[grid.side // 2, grid.side // 2] = 1
         spread = grid.mean(grid.on_canvas(spot, position_m), position_m)  # by the pixels of the canvas
@@ -352,14 +349,13 @@ class DrawnEvents:
 
     def __call__(self, planes: Tensor, generator: torch.Generator) -> Tensor:
         """Return the solved images of planes [B, P, P], [B, 2, P, P]."""
-        prior, side = self._prior, self._prior.target_plane.height
-        patterns = torch.from_numpy(prior.patterns)
-        inner = self._grid.target_of(planes, prior.target_plane.extent_m[0], side).flatten(1).double()
-        z = (inner - torch.from_numpy(prior.mean)) @ (patterns / patterns.square().sum(dim=0))
+        prior, size_m = self._prior, self._prior.target_plane.extent_m[0]
+        inner = self._grid.target_of(planes, size_m, prior.target_plane.height)
+        z = torch.from_numpy(prior.coefficients(inner.double().numpy()))
         score = z @ self._information + self._errors.draw(len(z), generator)
-        found = torch.einsum("nkl,bl->bnk", self._back, score) + self._none  # [B, n, k]
-        images = (torch.from_numpy(prior.mean) + found @ patterns.T).clamp(0, 1).unflatten(-1, (side, side))
-        seen = self._grid.of_target(images.float(), prior.target_plane.extent_m[0])
+        found = torch.einsum("nkl,bl->bnk", self._back, score)
+        images = torch.from_numpy(prior.image(found.numpy())).clamp(0, 1)
+        seen = self._grid.of_target(images.float(), size_m)
         blurred = F.conv2d(seen.flatten(0, 1)[:, None], self._blur, padding="same").view_as(seen)
         return self._scale(blurred)
 

@@ -70,6 +70,14 @@ class InputNormalization(nn.Module):
             return (x - mean) / size
         return (x - self.mean[:, None, None]) / self.size[:, None, None]
 
+    def of_surface(self, maps: Tensor) -> Tensor:
+        """Map surfaces of events alone [B, C', H, W] to what they are among all that is seen."""
+        groups = self.modality.groups
+        (own,) = (self.modality.slices[group.name] for group in groups if group.maps == ("surface",))
+        whole = maps.new_zeros(len(maps), self.modality.channels, *maps.shape[2:])
+        whole[:, own] = maps
+        return self(whole)[:, own]
+
     def _measured(self, x: Tensor, dims: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """Return mean and size over `dims`, [B or 1, C, 1, 1] each, of every group of channels."""
         means, sizes = [], []

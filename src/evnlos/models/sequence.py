@@ -32,7 +32,7 @@ from evnlos.models.drawn import (
     KnownSequence,
     TargetGrid,
     drawn_targets,
-    subset,
+    subsets,
 )
 from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input
 from evnlos.models.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor
@@ -270,12 +270,16 @@ class PooledFrames(nn.Module):
             kept: 1 where a subset has a time step, else 0, [K, N].
         """
         rows, _, single = self._rows(position_m)  # J [N, k, r], J J^T [N, k, k]
-        away, kept, static = away.double(), kept.double(), self.static.double()
-        share = static / (1.0 + kept.sum(dim=1, keepdim=True) * static)  # what an offset hides, [K, r]
-        summed, shifts = torch.tensordot(kept, rows, dims=1), kept @ away  # [K, k, r], [K, r]
-        information = torch.tensordot(kept, single, dims=1) - (summed * share[:, None]) @ summed.mT
-        score = kept @ (rows @ away[:, :, None])[..., 0] - (summed @ (share * shifts)[:, :, None])[..., 0]
+        away, kept = away.double(), kept.double()
+        summed, hidden = self._hidden(rows, kept)
+        information = torch.tensordot(kept, single, dims=1) - hidden @ summed.mT
+        score = kept @ (rows @ away[:, :, None])[..., 0] - (hidden @ (kept @ away)[:, :, None])[..., 0]
         return information, score
+
+    def _hidden(self, rows: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the sum of the rows of each subset, and its share that an offset hides, [K, k, r] each."""
+        static, summed = self.static.to(kept), torch.tensordot(kept, rows, dims=1)
+        return summed, summed * (static / (1.0 + kept.sum(dim=1, keepdim=True) * static))[:, None]
 
     def solved(self, information: Tensor, score: Tensor) -> Tensor:
         """Return the targets of each weight of the prior, [K, S, h, h]; arguments of `statistic`."""
@@ -312,9 +316,8 @@ class PooledFrames(nn.Module):
             mine = kept[:, step].nonzero()[:, 0]
             seen[mine] += light
             told[mine] += rows[step].float() @ light
-        static, summed = self.static, torch.tensordot(kept.float(), rows.float(), dims=1)
-        share = static / (1.0 + kept.sum(dim=1, keepdim=True) * static)
-        return told - (summed * share[:, None]) @ seen, base, information
+        _, hidden = self._hidden(rows, kept.double())
+        return told - hidden.float() @ seen, base, information
 
     def keep(self, rank: int) -> None:
         """Forget all but the `rank` components that carry most light; see `LinearEmbeddings.keep`."""
@@ -368,7 +371,7 @@ class SequenceReconstructor(Reconstructor):
         sampling: Size of the maps and their pitch on the target's canvas.
 
     Raises:
-        ConfigError: The canvas has too many pixels.
+        ConfigError: The pitch is too fine for the square that is drawn.
     """
 
     sees_sequence = True
@@ -443,9 +446,7 @@ class SequenceReconstructor(Reconstructor):
             mine = np.flatnonzero(samples.names == name)
             places = torch.from_numpy(samples.position_m[mine])
             plane = self.grid.mean(samples.truth[torch.from_numpy(mine)], places).half().cpu()
-            kept = torch.zeros(augmentations, len(mine))
-            for number in range(augmentations):
-                kept[number, subset(number, len(mine), draw)] = 1
+            kept = subsets(len(mine), augmentations, draw)
             seen = samples.inputs[torch.from_numpy(mine)].to(device)
             inputs.append(self.pooled_subsets(seen, places, kept, own.get(name)).half().cpu())
             truth += augmentations * [plane]
@@ -467,9 +468,8 @@ class SequenceReconstructor(Reconstructor):
             is_new: Whether light path and scale are taken; else `training_samples` was asked before.
         """
         if is_new and self.frames is not None:
-            self.check_samples(samples, is_new=True)
             self._fit_frames(samples, is_new=True)
-        shown, parts = known or samples, list[Callable[[Tensor, torch.Generator], Tensor]]()
+        shown, parts = samples if known is None else known, list[Callable[[Tensor, torch.Generator], Tensor]]()
         places = torch.from_numpy(shown.position_m)
         if self.frames is not None:
             solver, sequences = deepcopy(self.frames).cpu(), list[KnownSequence]()
@@ -481,19 +481,13 @@ class SequenceReconstructor(Reconstructor):
             parts.append(DrawnFrames(solver, sequences, self.grid))
         if self.embedding.images:
             of_one = places[shown.names == shown.names[0]]
-            parts.append(DrawnEvents(self.sampling, self.grid, self._scaled_events, of_one))
+            scale = deepcopy(self.normalization).cpu().of_surface
+            parts.append(DrawnEvents(self.sampling, self.grid, scale, of_one))
         found = DrawnSequences(drawn_targets(self.sampling.setup), self.grid, parts)
         if is_new:
             few = [found.batch(64, derive_seed(seed, "scale", number))[0] for number in range(4)]
             self.scale.fit(torch.cat(few).half())
         return found
-
-    def _scaled_events(self, images: Tensor) -> Tensor:
-        """Return images [B, 2, P, P] of solved events as the normalization leaves them."""
-        (own,) = (self.modality.slices[g.name] for g in self.modality.groups if g.maps == ("surface",))
-        whole = images.new_zeros(len(images), self.modality.channels, *images.shape[2:])
-        whole[:, own] = images
-        return deepcopy(self.normalization).cpu()(whole)[:, own]
 
     def check_samples(self, samples: NlosDataset, *, is_new: bool) -> None:
         """Refuse samples of unknown motion, and those without a setup where frames are solved through one."""

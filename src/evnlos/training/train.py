@@ -140,15 +140,16 @@ def train(
                 save_yaml(about, out / "run.yaml")
         processes.wait()
         history = [*(start.history if start else []), about]
-        known = captures and NlosDataset(captures, "train", network.modality)
-        given = dataset, samples, known
-        records = _epochs(network, given, settings, out, history, processes, start, progress)
+        known = None if captures is None else NlosDataset(captures, "train", network.modality)
+        records = _epochs(network, dataset, samples, known, settings, out, history, processes, start, progress)
     return TrainingResult(out, records)
 
 
 def _epochs(
     network: Reconstructor,
-    given: tuple[Dataset, NlosDataset | None, NlosDataset | None],
+    dataset: Dataset,
+    samples: NlosDataset | None,
+    known: NlosDataset | None,
     settings: Training,
     out: Path,
     history: list[dict[str, Any]],
@@ -157,7 +158,7 @@ def _epochs(
     progress: Progress,
 ) -> list[dict[str, Any]]:
     """Run the epochs that are left, write the weights after the last, and return the records of all."""
-    (dataset, samples, known), seed = given, settings.seed
+    seed = settings.seed
     checkpoint, metrics = out / "checkpoint.safetensors", out / "metrics.jsonl"
     what = f"train {out.name}"
     if (out / "weights.safetensors").is_file():
