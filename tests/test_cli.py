@@ -328,6 +328,10 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
     assert "does not exist" in fails(
         capsys, "finetune", "--weights", tmp_path / "w", "--data", recorded, "--out", out
     )
+    known = ("finetune", "--weights", runs["e2e-frame"], "--data", recorded, "--captures", recorded)
+    known += ("--out", out)
+    assert "drawn is 0; give --drawn" in fails(capsys, *known)
+    assert "leave --captures away" in fails(capsys, *known, "--choose")
     assert "not a folder" in fails(
         capsys, "reconstruct", tmp_path / "c", "--weights", runs["e2e-frame"], "--out", out
     )

@@ -435,7 +435,7 @@ def test_a_setup_keeps_the_errors_that_captures_show(tiny_captures: list[Path], 
     few = write_event_errors(tmp_path, tiny_captures, names)
     assert few is not None and few.about.gain_db == 0 and not gains_by_errors(tmp_path)
     file.unlink()
-    with pytest.raises(DataError, match=r"has no events\.safetensors, which the surface 'corrected' takes"):
+    with pytest.raises(DataError, match=r"has no events\.safetensors.* give --sampling\.surface likelihood"):
         capture_samples(another, sampling)
     # With a twin each, they know their own errors.
     twins = [shutil.copytree(folder, tmp_path / f"twin_{folder.name}") for folder in tiny_captures]

@@ -485,8 +485,14 @@ def test_events_of_drawn_targets_show_them(solved, tmp_path) -> None:
     setup = load_setup(dataset.sampling.setup)
     save_yaml(to_dict(setup), tmp_path / "setup.yaml")
     prior, grid = event_prior(setup, 0.08), network().grid
-    known = {"scores": torch.zeros(5, 120), "information": 1e10 * torch.eye(120)}
-    EVENT_ERRORS.write(tmp_path / EVENT_ERRORS_FILE, known, AboutErrors(tuple("ABCDE")))
+    file, about = tmp_path / EVENT_ERRORS_FILE, AboutErrors(tuple("ABCDE"))
+    for count in (120, prior.count):
+        known = {"scores": torch.zeros(5, count), "information": 1e10 * torch.eye(count)}
+        EVENT_ERRORS.write(file, known, about)
+        if count < prior.count:  # of an older calibration
+            sampling = Sampling(surface="likelihood", setup=str(tmp_path))
+            with pytest.raises(DataError, match=r"120 patterns .* 240; calibrate again, or leave --drawn at 0"):
+                DrawnEvents(sampling, grid, torch.abs, torch.zeros(1, 2))
     target = FontGlyphs(characters="F").target("comic_neue_bold_F").rasterise(prior.target_plane)
     at = torch.stack([torch.linspace(-0.05, 0.05, 40), torch.linspace(0.0, 0.01, 40)], dim=1)
     by_patterns = np.clip(prior.image(prior.coefficients(target)), 0, 1)
@@ -500,7 +506,7 @@ def test_events_of_drawn_targets_show_them(solved, tmp_path) -> None:
         assert images.shape == (1, 2, 80, 80)
         for image in images[0] / 2:
             assert (image - expected).square().mean() < 0.02 * expected.var()
-    with pytest.raises(ConfigError, match=r"has no events\.safetensors"):
+    with pytest.raises(DataError, match=r"has no events\.safetensors"):
         DrawnEvents(Sampling(setup=str(tmp_path / "none")), grid, torch.abs, at)
 
 

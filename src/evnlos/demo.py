@@ -269,7 +269,7 @@ def _study(settings: Demo, test: list[str], events: bool) -> Study:
         before = replace(anew, epochs=settings.pretrain_epochs or 4, learning_rate=1e-3, refit_embedding=True)
     # Gentle, so that it forgets little. Captures held out of it choose how much of it is taken, if any, unless
     # the pre-training has drawn their targets again and learned their errors: then they would choose none.
-    after = replace(plan, epochs=settings.finetune_epochs, learning_rate=5e-4, drawn=made // 14)
+    after = replace(plan, epochs=settings.finetune_epochs, learning_rate=5e-4, drawn=made // 6)
     after = replace(after, keep_normalization=True)
     source = "calibrated" if settings.calibrate else "uncalibrated"
     drawn = ROBUST if settings.robust else ""

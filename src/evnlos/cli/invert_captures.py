@@ -36,7 +36,7 @@ from evnlos.inverse import (
     sequence_light,
     unexplained,
 )
-from evnlos.inverse.event_images import CELLS, COEFFICIENTS
+from evnlos.inverse.event_images import CELLS
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
@@ -46,6 +46,8 @@ from evnlos.setups import Setup, load_setup
 from evnlos.setups.base import linear_kinds
 from evnlos.tracking import temporal_noise
 from evnlos.types import COLOURS, Colour, Plane
+
+_PATTERNS = 120  # of a target: all that a minute of a core allows where events are solved in full
 
 
 @dataclass(frozen=True)
@@ -302,7 +304,7 @@ def estimate_captures(
         if motion is None:
             raise ConfigError(f"{folder}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
         motion, size = motion.in_its_plane(), capture.info.target_size_m
-        prior = handwritten_prior(Plane(CELLS, CELLS, size / CELLS), COEFFICIENTS, ink=setup.ink)
+        prior = handwritten_prior(Plane(CELLS, CELLS, size / CELLS), _PATTERNS, ink=setup.ink)
         span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)
         shape = (capture.events.height, capture.events.width)
         key = (motion, span, shape, size)

@@ -142,9 +142,12 @@ class FinetuneCommand:
     weights: Path
     """Weights file, or the run to start from."""
     data: Path
-    """Folder of the dataset of captures."""
+    """Folder of the dataset of captures; with --refit-embedding it may be a simulation of another setup."""
     out: OutFolder
     """Folder of the run; new, or begun with the same settings."""
+    captures: Path | None = None
+    """Imported captures with known targets: newly drawn sequences (--drawn) err as these do, in place of those
+    of --data."""
     preset: str = "default"
     """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""
     config: Path | None = None
@@ -159,9 +162,12 @@ class FinetuneCommand:
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""
         dataset = open_dataset(self.data)
+        known = None if self.captures is None else open_dataset(self.captures)
         if not self.choose:
-            fit(dataset, self.settings, self.out, self.weights, self.json)
+            fit(dataset, self.settings, self.out, self.weights, self.json, known)
             return
+        if known is not None:
+            raise ConfigError("--choose tells by captures held out of --data; leave --captures away")
         candidates = alternatives(self.settings)
         with ProgressBars() as progress:
             trained = choose_and_finetune(dataset, candidates, self.out, self.weights, progress=progress)

@@ -16,35 +16,35 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling, confusion
 from evnlos.analysis.bounds import SequenceAnalysisSettings, sequence_bounds
 from evnlos.analysis.confidence import ConfidenceCheck, consistent, risk_coverage
 from evnlos.analysis.scores import Interval, aligned_mean, paired_difference
-from evnlos.config import from_dict, to_dict
+from evnlos.config import to_dict
 from evnlos.data import (
     Dataset,
     NlosDataset,
     Sampling,
-    Simulation,
     as_modality,
     character_of,
     modality_order,
     read_capture,
     read_shard,
-    read_shard_index,
 )
 from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
 from evnlos.files import write_atomically
 from evnlos.inverse.sequence_problem import SequenceOperator, strip_gram_of
 from evnlos.machine import Progress
-from evnlos.models import FrameOperator, fit_linear, load_weights, on_target_plane
+from evnlos.models import DrawnTargets, FrameOperator, drawn_targets, fit_linear, load_weights
 from evnlos.models.confidence import SIDE
 from evnlos.optics import MatrixTransport
+from evnlos.scene import Target
 from evnlos.setups import calibrated_file, load_setup
-from evnlos.types import Plane, derive_seed
+from evnlos.types import Plane
 
 if TYPE_CHECKING:
     from evnlos.experiment.presets import GeneralizationResult
@@ -147,7 +147,12 @@ def _without_network(
         return
     if study.retrieval and modality == "frame" and arm.source == "calibrated":
         setup = place.out / "setups" / study.setup
-        yield "retrieval", lambda: retrieved(made, recorded, study.split, _operator(setup, arm.sampling))
+        yield (
+            "retrieval",
+            lambda: retrieved(
+                drawn_targets(setup, place.workers), recorded, study.split, _operator(setup, arm.sampling)
+            ),
+        )
     if study.name == "captures":
         yield "linear, simulation", lambda: _linear(made, modality, samples)
         if modality == "frame":
@@ -160,16 +165,16 @@ def _linear(data: Dataset, modality: str, samples: NlosDataset) -> Tensor:
     return fit_linear(known.inputs, known.truth, known.names, modality=known.modality)(samples.inputs)
 
 
-def retrieved(made: Dataset, recorded: Dataset, split: str, operator: FrameOperator) -> Tensor:
-    """Return the simulated object that explains the frames of each sequence best, drawn where the target was.
+def retrieved(targets: DrawnTargets, recorded: Dataset, split: str, operator: FrameOperator) -> Tensor:
+    """Return the target that explains the frames of each sequence best, drawn where the target was.
 
-    With y the frames, A the light path and x an object at the known places, each less its mean over the
+    With y the frames, A the light path and x a target at the known places, each less its mean over the
     sequence, it has the least |y - g A x|^2 at its own best brightness g >= 0: the largest
     (x^T A^T y)^2 / (x^T A^T A x), from the normal equations of all time steps together. What stands still
     counts for nothing.
 
     Args:
-        made: The simulation whose objects are searched, all splits of it.
+        targets: What is searched.
         recorded: The captures.
         split: Which of them.
         operator: The calibrated setup.
@@ -178,13 +183,11 @@ def retrieved(made: Dataset, recorded: Dataset, split: str, operator: FrameOpera
         float32 [N, H, W], 0..1.
 
     Raises:
-        DataError: A motion is unknown, or the simulation's targets are.
+        DataError: A motion is unknown.
     """
-    config = from_dict(Simulation, made.config, source=str(made.folder))
-    names, canvas = made.objects(), made.sampling.canvas
-    size_m = config.glyphs.target_plane.size_m
+    masks, size_m, canvas = targets.masks.float(), targets.about.size_m, recorded.sampling.canvas
     plane = Plane(SIDE, SIDE, size_m / SIDE)
-    targets = torch.cat([_middle_target(made, name, size_m) for name in names]).flatten(1).double()  # [G, n n]
+    searched = F.interpolate(masks[:, None], plane.shape, mode="area").flatten(1).double()  # [G, n n]
     cells = Plane(operator.rows.stop - operator.rows.start, canvas.width, canvas.pitch_m)
     transport = MatrixTransport(operator.matrix, cells, operator.size)
     strip_gram = strip_gram_of(transport)
@@ -192,26 +195,15 @@ def retrieved(made: Dataset, recorded: Dataset, split: str, operator: FrameOpera
     for name in recorded.objects(split):
         samples, _ = read_shard(recorded.shard(name))
         if samples.position_m is None:
-            raise DataError(f"the motion of {name} is unknown; retrieval draws objects at known places")
+            raise DataError(f"the motion of {name} is unknown; retrieval draws targets at known places")
         sight = SequenceOperator(transport, plane, samples.position_m)
         frames = torch.from_numpy(samples.frame)
         back = sight.adjoint(frames - frames.mean(dim=0)).flatten().double()
-        power = ((targets @ sight.gram(strip_gram, math.inf)) * targets).sum(dim=1)
-        best = int(((targets @ back).clamp_min(0).square() / power.clamp_min(1e-12)).argmax())
-        target = config.glyphs.target(names[best], derive_seed(config.seed, "glyph"))
+        power = ((searched @ sight.gram(strip_gram, math.inf)) * searched).sum(dim=1)
+        best = int(((searched @ back).clamp_min(0).square() / power.clamp_min(1e-12)).argmax())
+        target = Target(name, masks[best].numpy(), size_m)
         found.append(torch.from_numpy(target.rasterise(canvas, samples.position_m)))
     return torch.cat(found)
-
-
-def _middle_target(made: Dataset, name: str, size_m: float) -> Tensor:
-    """Return the target of a simulated object, as the time step in the middle shows it, [1, 32, 32]."""
-    path = made.shard(name)
-    middle = read_shard_index(path).length // 2
-    samples, _ = read_shard(path, slice(middle, middle + 1))
-    if samples.truth is None or samples.position_m is None:
-        raise DataError(f"{path} has no truth; simulate with known targets")
-    canvas = made.sampling.canvas
-    return on_target_plane(torch.from_numpy(samples.truth), canvas, samples.position_m, size_m)[:, 0]
 
 
 def _consistent(study: Study, arm: Arm, recorded: Dataset, place: Place, images: Tensor) -> Tensor:

@@ -36,8 +36,8 @@ from evnlos.setups import Setup, load_setup
 from evnlos.tensor_file import TensorFile
 from evnlos.types import Events, Plane, target_side_m
 
-CELLS, COEFFICIENTS = 32, 120
-"""Cells along a side of the target, patterns of its prior."""
+CELLS, COEFFICIENTS = 32, 240
+"""Cells along a side of the target, patterns of its prior; what fewer leave out shines as errors do."""
 EVENT_ERRORS_FILE = "events.safetensors"
 """What captures showed of the errors of a calibrated setup, in its folder."""
 
@@ -137,6 +137,31 @@ EVENT_ERRORS = TensorFile(
 """Errors of events on disk."""
 
 
+def event_errors(setup: str | Path, instead: str) -> EventErrors:
+    """Return what captures with known targets showed that a setup gets wrong of its events.
+
+    Args:
+        setup: Folder of `evnlos calibrate`.
+        instead: What to do without them, for the error.
+
+    Raises:
+        DataError: They are not there, damaged, or about other patterns than events are solved for.
+    """
+    path = Path(setup) / EVENT_ERRORS_FILE
+    if not path.is_file():
+        raise DataError(
+            f"{setup} has no {EVENT_ERRORS_FILE}, which says what events of known targets miss; calibrate "
+            f"again, or {instead}"
+        )
+    found = EVENT_ERRORS.load(path, "")
+    if len(found.information) != COEFFICIENTS:
+        raise DataError(
+            f"{path} is about {len(found.information)} patterns of the target, and events are solved for "
+            f"{COEFFICIENTS}; calibrate again, or {instead}"
+        )
+    return found
+
+
 def gains_by_errors(setup: Path) -> bool:
     """Return whether captures gain before any network where what others showed of errors is taken from events.
 
@@ -207,15 +232,10 @@ def event_images(
         ConfigError: No setup is named, it is not linear, or its event model states no law of its crossings.
         DataError: The motion is unknown, or the file of errors is damaged or not there.
     """
-    path = Path(setup) / EVENT_ERRORS_FILE
-    if capture is not None and not path.is_file():
-        raise DataError(
-            f"{setup} has no {EVENT_ERRORS_FILE}, which the surface 'corrected' takes and `evnlos calibrate` "
-            "writes where it fits events; give --sampling.surface likelihood"
-        )
+    errors = capture and event_errors(setup, "give --sampling.surface likelihood")
     statistic, prior, places = event_statistic(events, edges_us, motion, setup, target_side_m(canvas))
-    if capture is not None:
-        statistic = EVENT_ERRORS.load(path, "").corrected(statistic, capture)
+    if capture and errors:
+        statistic = errors.corrected(statistic, capture)
     images = []
     for z in statistic.solutions(EVENT_PRIORS):
         mask = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)

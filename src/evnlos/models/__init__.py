@@ -1,7 +1,7 @@
 """Reconstructors, their closed-form parts, the confidence in their images, and their weights on disk."""
 
 from evnlos.models.confidence import Confidence, ConfidenceReport, halves_of, on_target_plane
-from evnlos.models.drawn import DrawnSequences, drawn_targets
+from evnlos.models.drawn import DrawnSequences, DrawnTargets, drawn_targets
 from evnlos.models.embedding import FrameOperator
 from evnlos.models.reconstructor import (
     RECONSTRUCTORS,
@@ -32,6 +32,7 @@ __all__ = [
     "Confidence",
     "ConfidenceReport",
     "DrawnSequences",
+    "DrawnTargets",
     "FrameOperator",
     "LinearEstimate",
     "Reconstructor",

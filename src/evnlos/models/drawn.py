@@ -25,7 +25,7 @@ from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Sampling, Simulation
 from evnlos.data.pool import run_in_order
 from evnlos.errors import ConfigError
-from evnlos.inverse.event_images import EVENT_ERRORS, EVENT_ERRORS_FILE, counted, event_prior
+from evnlos.inverse.event_images import counted, event_errors, event_prior
 from evnlos.inverse.prior import ScoreErrors
 from evnlos.inverse.sequence_light import EVENT_PRIORS
 from evnlos.inverse.sequence_statistic import EventStatistic
@@ -126,7 +126,7 @@ DRAWN_FILE = "drawn.safetensors"
 
 _DRAWN = 1024  # targets: more take long to draw, and what is bent anew is as good as new
 _SIDE, _AT_ONCE, _COUNT = 64, 32, 8  # pixels of one; drawn at a time; subsets of the time steps
-_TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.08, 0.07, 0.05, 0.12, 0.015, 0.03
+_TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.04, 0.035, 0.025, 0.06, 0.008, 0.015
 _WAVES = 5  # knots along a side of the field that bends
 
 
@@ -318,19 +318,13 @@ class DrawnEvents:
         position_m: Places of the target in a sequence, [N, 2].
 
     Raises:
-        ConfigError: The setup's folder says nothing of its errors.
+        DataError: The setup's folder says nothing of its errors.
     """
 
     def __init__(
         self, sampling: Sampling, grid: TargetGrid, scale: Callable[[Tensor], Tensor], position_m: Tensor
     ) -> None:
-        path = _folder(sampling.setup) / EVENT_ERRORS_FILE
-        if not path.is_file():
-            raise ConfigError(
-                f"{sampling.setup} has no {EVENT_ERRORS_FILE}, which says what events of known targets miss; "
-                "calibrate again, or leave --drawn at 0"
-            )
-        known = EVENT_ERRORS.load(path, "")
+        known = event_errors(_folder(sampling.setup), "leave --drawn at 0")
         self._prior = event_prior(load_setup(sampling.setup), target_side_m(sampling.canvas))
         self._grid, self._scale = grid, scale
         a = known.information.double().numpy()
