@@ -549,3 +549,19 @@ def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeyp
     ]
     assert [list(r.positions) for r in found[1:]] == [["kalam_G"]] * 3
     assert simulated.run_simulated(settings) == []
+
+
+def test_simulated_objects_tell_the_confidence_where_others_are_drawn(place, monkeypatch) -> None:
+    """Of a hundred objects a twentieth held out is fewer than the eight that tell a confidence."""
+    kept = list[float]()
+
+    def refuse(config: Simulation, *_: object, **__: object) -> None:
+        kept.append(config.validation)
+        raise DataError("enough")
+
+    monkeypatch.setattr(sys.modules["evnlos.experiment.run"], "simulate", refuse)
+    for drawn in (0, 8):
+        arm = replace(ARMS[1], pretraining=replace(SMALL, drawn=drawn))
+        with pytest.raises(DataError, match="enough"):
+            run_study(replace(STUDY, arms=(arm,)), place)
+    assert kept == [0.0, 0.3]

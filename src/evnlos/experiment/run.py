@@ -282,10 +282,10 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
         config = study.simulation or default()
     glyphs = config.glyphs
     assert isinstance(glyphs, HandwritingGlyphs)
-    glyphs = replace(glyphs, writers=study.writers if arm.writers is None else arm.writers)
-    if glyphs.known:
-        glyphs = replace(glyphs, redrawn=study.redrawn)
-    config = replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
+    again = study.redrawn if glyphs.known else glyphs.redrawn
+    glyphs = replace(glyphs, writers=study.writers if arm.writers is None else arm.writers, redrawn=again)
+    kept, ranges = max(config.validation, arm.held_out), config.vary | arm.vary
+    config = replace(config, glyphs=glyphs, sampling=arm.sampling, vary=ranges, validation=kept)
     return randomized(config) if study.robust else config
 
 

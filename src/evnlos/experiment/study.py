@@ -43,8 +43,7 @@ class Arm:
     finetuning: Training | None = None
     """Settings of the fine-tuning, or of the end-to-end training where there is no pre-training."""
     start: str = ""
-    """Setup of installed weights of sequences; the arm's first training begins with their layers. Empty: with
-    random ones."""
+    """Setup of installed weights whose layers the arm's first training begins with. Empty: random ones."""
     anew: Training | None = None
     """Settings of the pre-training of networks that `start` has no layers for; None: those of the others."""
     choose: bool = False
@@ -103,6 +102,11 @@ class Arm:
         assert self.finetuning is not None
         # Captures alone tell more of events than with sequences drawn beside them.
         return replace(self.finetuning, drawn=self.finetuning.drawn * as_modality(modality).needs_frames)
+
+    @property
+    def held_out(self) -> float:
+        """Least share of simulated objects that tell the confidence alone: more where others are drawn."""
+        return 0.3 if self.pretraining and self.pretraining.drawn else 0.0
 
     @property
     def needs_setup(self) -> bool:
