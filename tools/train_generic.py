@@ -35,8 +35,8 @@ from evnlos.config import save_yaml, to_dict
 from evnlos.data import Sampling, Simulation
 from evnlos.data.simulate import ranges_around, simulate_object
 from evnlos.demo import sequence_network
-from evnlos.inverse import EVENT_ERRORS, EVENT_ERRORS_FILE, AboutErrors
-from evnlos.inverse.event_images import event_statistic
+from evnlos.inverse.event_images import EventErrors, event_prior, event_statistic
+from evnlos.inverse.sequence_statistic import EventStatistic
 from evnlos.machine import ProgressBars, Step
 from evnlos.models import SequenceReconstructor, Weights, layers_of, load_weights, save_weights
 from evnlos.models.drawn import (
@@ -46,13 +46,15 @@ from evnlos.models.drawn import (
     DrawnSequences,
     DrawnTargets,
     KnownSequence,
+    TargetGrid,
+    masks_of,
 )
 from evnlos.models.sequence import PooledFrames
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, HandwritingGlyphs, Ink, LineMotion, Strokes
 from evnlos.setups import RadiometricSetup, Setup
 from evnlos.training import LOSSES, Training, learning_rate_at
 from evnlos.training.settings import light_of
-from evnlos.types import Plane, derive_seed, target_side_m
+from evnlos.types import derive_seed, target_side_m
 
 _NETWORK = replace(sequence_network(), frames="likelihood")
 _MODALITIES = ("frame", "event", "fusion")
@@ -60,7 +62,6 @@ _BATCH, _OF_WALLS, _WARM_UP = 32, 4, 200  # sequences of a step, walls that they
 _HELD_OUT = 8  # every so many walls is not learned from
 _SEQUENCES = 14  # of a wall, which tell by how much its light path errs
 _MOST_DOUBT, _LEARNED_DOUBT = 1000.0, 300.0  # that are drawn; walls that are doubted more teach nothing of use
-_SIDE_PX = 64  # of a drawn target
 
 
 @Setup.registry.register
@@ -68,7 +69,7 @@ _SIDE_PX = 64  # of a drawn target
 class DoubtedMetal(RadiometricSetup):
     """Rough metal as a calibration leaves it: known so far."""
 
-    kind: Literal["doubted-metal"] = "doubted-metal"
+    kind: Literal["doubted-metal"] = "doubted-metal"  # pyright: ignore[reportIncompatibleVariableOverride]
     """Kind of this setup."""
     frame_doubt: float = 1.0  # pyright: ignore[reportIncompatibleVariableOverride]
     """By how much the variance of the frames' noise is raised."""
@@ -161,24 +162,17 @@ def solve(number: int, out: Path) -> Path | None:
         KnownSequence(*parts, solver)
         for parts in zip(frames.split(steps), truth.split(steps), places.split(steps), strict=True)
     ]
-    network = _NETWORK.build("fusion", sampling)
-    assert isinstance(network, SequenceReconstructor)
-    scores, information = list[np.ndarray](), list[np.ndarray]()
-    for name, (samples, events) in zip(names, made, strict=True):
+    side_m, glyph_seed = target_side_m(sampling.canvas), derive_seed(plan.seed, "glyph")
+    prior, said = event_prior(plan.setup, side_m), list[EventStatistic]()
+    for samples, events in made:
         edges_us = np.append(0, np.round(1e6 * samples.time_s)).astype(np.int64)
-        side_m = target_side_m(sampling.canvas)
-        said, prior, _ = event_statistic(events, edges_us, plan.motion, sampling.setup, side_m)
-        target = plan.glyphs.target(name, derive_seed(plan.seed, "glyph")).rasterise(prior.target_plane)
-        scores.append(said.score - said.information @ prior.coefficients(target))
-        information.append(said.information)
-    tensors = {
-        "scores": torch.from_numpy(np.stack(scores)).float(),
-        "information": torch.from_numpy(np.mean(information, axis=0)).float(),
-    }
-    EVENT_ERRORS.write(folder / EVENT_ERRORS_FILE, tensors, AboutErrors(tuple(names)))
+        said.append(event_statistic(events, edges_us, plan.motion, sampling.setup, side_m)[0])
+    truths = [plan.glyphs.target(name, glyph_seed).rasterise(prior.target_plane) for name in names]
+    EventErrors.of(names, said, prior, truths).write(folder)
+    grid = TargetGrid(sampling)
     parts = {
-        "frame": DrawnFrames(solver, known, network.grid),
-        "event": DrawnEvents(sampling, network.grid, torch.clone, places[:steps]),
+        "frame": DrawnFrames(solver, known, grid),
+        "event": DrawnEvents(sampling, grid, torch.clone, places[:steps]),
     }
     torch.save(parts, file.with_suffix(".part"))
     file.with_suffix(".part").rename(file)
@@ -241,9 +235,7 @@ def trained(modality: str, files: list[Path], start: str, steps: int, progress: 
     assert isinstance(network, SequenceReconstructor)
     if start:
         network.take_layers(load_weights(layers_of(start, modality)[0]).network)
-    cells = Plane(_SIDE_PX, _SIDE_PX, _LETTERS.target_plane.size_m / _SIDE_PX)
-    drawn = [_LETTERS.target(name, 0).rasterise(cells) for name in _LETTERS.objects()]
-    masks = torch.from_numpy(np.stack(drawn)).half()
+    masks = torch.from_numpy(np.stack([mask for mask, _ in masks_of(_LETTERS, 0, _LETTERS.objects())])).half()
     held_out = files[::_HELD_OUT] if len(files) > _HELD_OUT else files
     learned = [file for file in files if file not in held_out] or files
     walls, others = (Walls(some, modality, masks, network) for some in (learned, held_out))

@@ -64,7 +64,7 @@ class Demo:
     """Setup of installed weights whose layers the pre-training begins with; empty: random ones."""
     drawn: int = 2272
     """Sequences of newly drawn targets in an epoch of the pre-training, made in closed form behind the
-    calibrated setup; a fine-tuning sees a fourteenth beside the captures. 0: learn from rendered sequences."""
+    calibrated setup; a fine-tuning sees a sixth beside the captures. 0: learn from rendered sequences."""
     pretrain_epochs: int | None = None
     """Epochs on the simulated sequences; by default 4 from trained layers, 8 from random ones."""
     finetune_epochs: int = 20

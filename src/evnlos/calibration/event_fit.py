@@ -35,9 +35,7 @@ from evnlos.data import Simulation, read_capture
 from evnlos.data.pool import run_in_order
 from evnlos.errors import ConfigError
 from evnlos.inverse.event_images import (
-    EVENT_ERRORS,
     EVENT_ERRORS_FILE,
-    AboutErrors,
     EventErrors,
     event_statistic,
 )
@@ -357,15 +355,5 @@ def write_event_errors(
         return None
     prior = solved[0].prior
     statistics, truths = [one.statistic for one in solved], [one.truth for one in solved]
-    scores = [
-        one.score - one.information @ prior.coefficients(truth)
-        for one, truth in zip(statistics, truths, strict=True)
-    ]
-    tensors = {
-        "scores": torch.from_numpy(np.stack(scores)).float(),
-        "information": torch.from_numpy(np.mean([one.information for one in statistics], axis=0)).float(),
-    }
-    errors = EventErrors(AboutErrors(tuple(one.name for one in solved)), **tensors)
-    about = replace(errors.about, gain_db=errors.gain_db(statistics, prior, truths))
-    EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, about)
-    return replace(errors, about=about)
+    errors = EventErrors.of([one.name for one in solved], statistics, prior, truths)
+    return errors.write(setup, errors.gain_db(statistics, prior, truths))

@@ -31,12 +31,11 @@ from evnlos.inverse import (
     SequenceOperator,
     SequenceProblem,
     estimate_sequence,
-    handwritten_prior,
     record_of,
     sequence_light,
     unexplained,
 )
-from evnlos.inverse.event_images import CELLS
+from evnlos.inverse.event_images import event_prior
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
@@ -304,7 +303,7 @@ def estimate_captures(
         if motion is None:
             raise ConfigError(f"{folder}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
         motion, size = motion.in_its_plane(), capture.info.target_size_m
-        prior = handwritten_prior(Plane(CELLS, CELLS, size / CELLS), _PATTERNS, ink=setup.ink)
+        prior = event_prior(setup, size, _PATTERNS)
         span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)
         shape = (capture.events.height, capture.events.width)
         key = (motion, span, shape, size)

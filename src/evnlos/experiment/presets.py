@@ -193,15 +193,14 @@ def sequence(setup: str) -> Study:
     most likely through it, and learns from newly drawn targets: what is simulated tells light path, noise and
     scale. Both E2E have exact further captures, too.
     """
-    before = _DRAWN_PRETRAINING
     sees = Sampling(surface="likelihood")
     arms = (
         Arm("E2E, single positions", "none", None, END_TO_END),
         Arm("E2E, single positions, augmented", "none", None, END_TO_END, augment=True),
         Arm("E2E sequence", "none", None, replace(_SEQUENCE, epochs=60)),
         Arm("E2E sequence, augmented", "none", None, replace(_SEQUENCE, epochs=60), augment=True),
-        Arm("simulation only sequence", "calibrated", before, None, sampling=sees),
-        Arm("EPNP sequence", "calibrated", before, _DRAWN_FINETUNING, sampling=sees),
+        Arm("simulation only sequence", "calibrated", _DRAWN_PRETRAINING, None, sampling=sees),
+        Arm("EPNP sequence", "calibrated", _DRAWN_PRETRAINING, _DRAWN_FINETUNING, sampling=sees),
     )
     return Study("sequence", setup, arms, writers=2, average=True, retrieval=True)
 

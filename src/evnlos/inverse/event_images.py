@@ -79,6 +79,37 @@ class EventErrors:
         if self.scores.shape != (len(self.about.captures), count) or self.information.ndim != 2:
             raise DataError(f"scores {list(self.scores.shape)} of {len(self.about.captures)} captures")
 
+    @classmethod
+    def of(
+        cls,
+        names: Sequence[str],
+        statistics: Sequence[EventStatistic],
+        prior: PatternPrior,
+        truths: Sequence[NDArray[np.floating]],
+    ) -> EventErrors:
+        """Return what sequences of known targets show.
+
+        Args:
+            names: Of the captures.
+            statistics: What the events of each say if the setup is right.
+            prior: What they are about.
+            truths: True target of each, on the cells of the prior, [h, w].
+        """
+        missed = [
+            one.score - one.information @ prior.coefficients(true)
+            for one, true in zip(statistics, truths, strict=True)
+        ]
+        information = np.mean([one.information for one in statistics], axis=0)
+        tensors = (torch.from_numpy(part).float() for part in (np.stack(missed), information))
+        return cls(AboutErrors(tuple(names)), *tensors)
+
+    def write(self, setup: Path, gain_db: float = 0.0) -> EventErrors:
+        """Write them to the folder of a setup, with what captures gain by them, and return them with that."""
+        found = replace(self, about=replace(self.about, gain_db=gain_db))
+        tensors = {"scores": self.scores, "information": self.information}
+        EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, found.about)
+        return found
+
     def corrected(self, statistic: EventStatistic, capture: str) -> EventStatistic:
         """Return what events say once the errors that other captures showed are known.
 
@@ -232,9 +263,9 @@ def event_images(
         ConfigError: No setup is named, it is not linear, or its event model states no law of its crossings.
         DataError: The motion is unknown, or the file of errors is damaged or not there.
     """
-    errors = capture and event_errors(setup, "give --sampling.surface likelihood")
+    errors = None if capture is None else event_errors(setup, "give --sampling.surface likelihood")
     statistic, prior, places = event_statistic(events, edges_us, motion, setup, target_side_m(canvas))
-    if capture and errors:
+    if errors is not None and capture is not None:
         statistic = errors.corrected(statistic, capture)
     images = []
     for z in statistic.solutions(EVENT_PRIORS):
@@ -243,14 +274,15 @@ def event_images(
     return np.stack(images, axis=1)
 
 
-def event_prior(setup: Setup, side_m: float) -> PatternPrior:
+def event_prior(setup: Setup, side_m: float, patterns: int = COEFFICIENTS) -> PatternPrior:
     """Return the prior over targets that events are solved with: letters as large as the setup's known ones.
 
     Args:
         setup: The setup.
         side_m: Side of the target plane, metres.
+        patterns: Patterns that are kept.
     """
-    return handwritten_prior(Plane(CELLS, CELLS, side_m / CELLS), COEFFICIENTS, ink=setup.ink)
+    return handwritten_prior(Plane(CELLS, CELLS, side_m / CELLS), patterns, ink=setup.ink)
 
 
 @lru_cache(maxsize=2)

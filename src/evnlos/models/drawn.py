@@ -196,7 +196,7 @@ def drawn_targets(setup: str | Path, workers: int = 1) -> DrawnTargets:
     note("draw targets")
     names = glyphs.objects()
     tasks = [names[k : k + _AT_ONCE] for k in range(0, len(names), _AT_ONCE)]
-    parts = run_in_order(partial(_drawn, glyphs, simulation.seed), tasks, workers)
+    parts = run_in_order(partial(masks_of, glyphs, simulation.seed), tasks, workers)
     masks, sizes = zip(*(pair for part in parts for pair in part), strict=True)
     found = DrawnTargets(AboutDrawn(key, float(sizes[0])), torch.from_numpy(np.stack(masks)).half())
     with suppress(OSError):  # where nothing can be kept they are drawn anew each time
@@ -210,7 +210,7 @@ def _folder(setup: str | Path) -> Path:
     return path.parent if path.is_file() else path
 
 
-def _drawn(glyphs: Glyphs, seed: int, names: list[str]) -> list[tuple[NDArray, float]]:
+def masks_of(glyphs: Glyphs, seed: int, names: list[str]) -> list[tuple[NDArray, float]]:
     """Return mask and side of some targets."""
     found = list[tuple[NDArray, float]]()
     for name in names:
