@@ -266,6 +266,7 @@ class Phone:
         auto_exposure_s: Time constant of that, seconds.
         shake_px: Root mean square of a hand's movement, pixels of the film, along each axis.
         clock_ppm: By how much the phone's clock runs faster than the display's, millionths.
+        quality: H.264's CRF of the film, 1 (best) to 51.
 
     Raises:
         ConfigError: A value outside its range.
@@ -293,6 +294,8 @@ class Phone:
     """Root mean square of a hand's movement, pixels of the film; 0 = on a tripod."""
     clock_ppm: float = 20.0
     """By how much the phone's clock runs faster than the display's, millionths."""
+    quality: int = 20
+    """H.264's CRF of the film, 1 (best) to 51."""
 
     def __post_init__(self) -> None:
         limits = {
@@ -306,6 +309,7 @@ class Phone:
             "auto_exposure_s": (0.01, 100.0),
             "shake_px": (0.0, 100.0),
             "clock_ppm": (-1e4, 1e4),
+            "quality": (1, 51),
         }
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:

@@ -389,6 +389,6 @@ def rehearse_film(
                 progress(Step("film", number, total, "frames"))
             yield frame
 
-    write_video(folder / "film.mp4", frames(), phone.frame_rate_hz, 20, "fast")
+    write_video(folder / "film.mp4", frames(), phone.frame_rate_hz, phone.quality, "fast")
     progress(Step("film", total, total, "frames"))
     return folder / "film.mp4"
