@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from evnlos.cameras import FrameCamera
+from evnlos.cli.datasets import SimulateCommand
 from evnlos.config import from_dict, to_dict
+from evnlos.data import Simulation
 from evnlos.errors import ConfigError
 from evnlos.lab import Lobe, Mount, Reflection, Torch
 from evnlos.scene import LineMotion, Scene, Target
@@ -188,3 +190,13 @@ def test_a_torch_that_shows_nothing_is_refused():
     dark = Torch(place_m=(0.0, 0.0, 0.1), radius_m=0.0, holder_m=(0.0, 0.0, 0.11, 1.0))
     with pytest.raises(ConfigError, match="no light of the target"):
         room(lamp=dark).observe(scene())
+
+
+@pytest.mark.parametrize("name", ["circuit", "celex", "slow-bus"])
+def test_a_simulation_in_a_room_keeps_the_sensor_of_the_room(name):
+    asked = Simulation(vary={"setup.pixel.threshold_on": (0.1, 0.2), "motion.speed_m_s": (0.01, 0.02)})
+    made, own = SimulateCommand.with_setup(asked, name), load_setup(name)
+    assert made.setup == dataclasses.replace(own, sensor=asked.setup.sensor)
+    assert list(made.vary) == ["motion.speed_m_s"]
+    wall = SimulateCommand.with_setup(asked, "main-far")
+    assert wall.setup.pixel == asked.setup.pixel and list(wall.vary) == list(asked.vary)

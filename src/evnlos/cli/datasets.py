@@ -62,8 +62,8 @@ class SimulateCommand:
     """YAML file with settings that replace the preset's."""
     setup: str | None = None
     """The setup instead of the preset's: a name (main-near, matte-far, ...), a settings file, a folder that
-    `evnlos calibrate` wrote, or a file of `evnlos scan import`. A name leaves the cameras to the preset; ranges
-    over the preset's wall are dropped."""
+    `evnlos calibrate` wrote, or a file of `evnlos scan import`. A wall's name leaves the cameras to the preset,
+    a room (worn, circuit, ...) the number of pixels alone; ranges over what it states are dropped."""
     pixel: str | None = None
     """The event pixel instead of the setup's: a preset's name, or a YAML file, as `evnlos pixel fit`
     writes it."""
@@ -89,14 +89,15 @@ class SimulateCommand:
     def with_setup(settings: Simulation, word: str) -> Simulation:
         """Return the simulation with the setup of `--setup`, without the ranges over the wall that it had."""
         setup = load_setup(word)
-        if is_name(word):
+        is_room = is_name(word) and setup.is_lit
+        if is_room:
+            setup = replace(setup, sensor=settings.setup.sensor)
+        elif is_name(word):
             setup = setup.with_cameras_of(settings.setup)
-        over_cameras = {
-            path: ends
-            for path, ends in settings.vary.items()
-            if not path.startswith("setup.") or is_camera(path)
-        }
-        return replace(settings, setup=setup, vary=over_cameras)
+        # Ranges over cameras go on, but for a room, which states its own.
+        stated = [p for p in settings.vary if p.startswith("setup.") and (is_room or not is_camera(p))]
+        vary = {path: ends for path, ends in settings.vary.items() if path not in stated}
+        return replace(settings, setup=setup, vary=vary)
 
     @staticmethod
     def with_pixel(settings: Simulation, word: str) -> Simulation:
