@@ -29,7 +29,7 @@ from evnlos.report.pictures import curves_svg
 from evnlos.report.provenance import Commands
 from evnlos.report.sections import _points, _worst, gains_of, setup_section
 from evnlos.report.tables import named, seen_in_training
-from evnlos.setups import PaperSetup, RadiometricSetup, calibrated_folder, named_setup, setup_preset
+from evnlos.setups import PaperSetup, RadiometricSetup, lit_setup, named_setup, setup_preset
 
 POSITIONS = 12
 
@@ -154,7 +154,7 @@ def test_report_and_reconstruct_take_a_calibrated_folder_and_say_what_else(tmp_p
     for given in (folder, folder / "setup.yaml"):
         assert named_setup(given).setup == transport
         assert named_setup(given).word == named_setup(given).name == "near_setup"
-        assert calibrated_folder(given) == folder
+        assert lit_setup(given) == transport
     save_yaml(Simulation(), tmp_path / "mine.yaml")
     save_yaml(Simulation(), folder / "dataset.yaml")
     assert named_setup(tmp_path / "mine.yaml").word == "mine.yaml"
@@ -163,7 +163,9 @@ def test_report_and_reconstruct_take_a_calibrated_folder_and_say_what_else(tmp_p
     with pytest.raises(SystemExit):
         main(["reconstruct", str(tmp_path), "--setup", "main-near", "--out", str(tmp_path / "out")])
     said = capsys.readouterr().err
-    assert "holds no setup.yaml" in said and "`calibrate` wrote" in said and "main-near" in said
+    assert "error: --setup main-near states neither the light nor the cameras of a recording; give" in said
+    assert "`calibrate` wrote" in said and said.count("\n") == 1
+    assert lit_setup("worn") == named_setup("worn").setup and lit_setup(tmp_path / "mine.yaml") == PaperSetup()
     assert not (tmp_path / "out").exists()
 
 

@@ -26,7 +26,6 @@ from evnlos.setups import (
     RadiometricSetup,
     SensorSize,
     Setup,
-    calibrated_folder,
     load_setup,
     named_setup,
     setup_names,
@@ -253,6 +252,11 @@ def test_words_become_setups(tmp_path: Path) -> None:
     assert load_setup(measured.file) == replace(measured, gain=1.0)
     for word, says in (
         ("main-nera", "perhaps you meant 'main-near'"),
+        ("worm", "perhaps you meant 'worn'"),
+        ("nothing", "two-lobes"),
+        ("", "the setup is ''; give a wall (mirror"),
+        (None, "the setup is None; give a wall (mirror"),
+        (3, "the setup is 3; give a wall (mirror"),
         (tmp_path / "none.yaml", "does not exist"),
         (tmp_path, "holds no setup.yaml"),
     ):
@@ -370,7 +374,6 @@ def test_files_that_speak_of_rigs_and_plates_load(tmp_path: Path) -> None:
     for word in (folder, folder / "rig.yaml"):
         found = named_setup(word)
         assert (found.setup, found.name, found.word) == (RadiometricSetup(roughness=0.07), "near", "near")
-        assert calibrated_folder(word) == folder
     assert load_yaml(Simulation, folder / "rig.yaml").setups == 6
     assert load_yaml(Simulation, folder / "rig.yaml").glyphs.target_plane.size_m == 0.05
     assert migrate("TargetInfo", {"name": "R", "plate_m": 0.05}) == {"name": "R", "size_m": 0.05}

@@ -192,8 +192,9 @@ class EvaluateCommand:
     lpips_heads: Path | None = None
     """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
     setup: Path | None = None
-    """The calibrated setup (the folder that `calibrate` wrote): the confidence then asks how much of the frames
-    the images explain. Without it weights take the setup that they were trained for, where it is known."""
+    """The setup of the data (the folder that `calibrate` wrote, a settings file, a room's name): the confidence
+    then asks how much of the frames the images explain. Without it weights take the setup that they were
+    trained for, where it is known."""
     positions: tuple[int, ...] = ()
     """Numbers of positions, e.g. 1 2 5 10 20 40: also how the image of a sequence network grows with them."""
     json: bool = False
@@ -203,14 +204,14 @@ class EvaluateCommand:
         """Evaluate and print."""
         from evnlos.analysis import available_lpips, curve_over_positions, evaluate, load_lpips, load_model
         from evnlos.report import refuse_seen, seen_in_training
-        from evnlos.setups import calibrated_folder, load_setup
+        from evnlos.setups import lit_setup
 
         dataset, model = open_dataset(self.data), load_model(self.weights)
         weights = model.weights
         split = self.split or ("test" if dataset.split.get("test") else "all")
         refuse_seen(weights.history, dataset, split)
         metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
-        known = load_setup(calibrated_folder(self.setup)) if self.setup else model.known_setup()
+        known = lit_setup(self.setup) if self.setup else model.known_setup()
         curve = []
         with ProgressBars() as progress:
             if self.positions:

@@ -53,10 +53,10 @@ class ReconstructCommand:
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
     setup: Path | None = None
-    """The calibrated setup: the folder that `calibrate` wrote, or the settings file in it. Its fixed pattern is
-    taken from the frames, the images are moved to where its wall agrees with the frames, and it is printed
-    how much of the frames they explain. No name such as main-near: that needs the light and the camera of this
-    very setup. Without it, the setup that the weights were trained for explains the frames, if known."""
+    """The recording's setup: the folder that `calibrate` wrote, a settings file, or a room's name. Its fixed
+    pattern is taken from the frames, the images are moved to where its wall agrees with the frames, and it is
+    printed how much of the frames they explain. A wall such as main-near states neither light nor cameras.
+    Without it, the setup that the weights were trained for explains the frames, if known."""
     track: bool = False
     """Find the motion in the recording, as `evnlos track` does, also where capture.yaml states it; needs
     --setup, and takes about a minute."""
@@ -73,12 +73,10 @@ class ReconstructCommand:
         """Reconstruct and print where the images are."""
         from evnlos.data import pattern_of
         from evnlos.report import reconstruct_capture
-        from evnlos.setups import calibrated_folder, load_setup
+        from evnlos.setups import lit_setup
 
-        folder = calibrated_folder(self.setup) if self.setup else None
-        pattern = pattern_of(folder, self.pattern)
-        setup = load_setup(folder) if folder else None
-        known = {"pattern": pattern, "setup": setup, "track": self.track}
+        setup = lit_setup(self.setup) if self.setup else None
+        known = {"pattern": pattern_of(self.setup, self.pattern), "setup": setup, "track": self.track}
         with ProgressBars() as progress:
             found = reconstruct_capture(self.capture, self.weights, self.out, **known, progress=progress)
         for warning in found.get("warnings", []):
@@ -280,8 +278,8 @@ class IdentifyCommand:
     """Say what a setup can show at all: modes above the noise, finest stroke, best linear image, in words."""
 
     setups: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names (main-near, matte-far, ..., simulate-paper), settings files, folders of `calibrate`, files of
-    `scan import`."""
+    """Names (main-near, matte-far, ..., rooms such as worn, simulate-paper), settings files, folders of
+    `calibrate`, files of `scan import`."""
     setup: tuple[str, ...] = ()
     """The same, as in the other commands."""
     all: bool = False
@@ -310,11 +308,12 @@ class IdentifyCommand:
         from evnlos.analysis.bounds import sequence_bounds
         from evnlos.analysis.identify import identify, setup_table
         from evnlos.plot.results import draw_identification, draw_setups
-        from evnlos.setups import named_setup, setup_names
+        from evnlos.setups import ROOMS, named_setup, setup_names
 
         names = [*self.setups, *self.setup, *(setup_names() if self.all else [])]
         if not names:
-            raise ConfigError(f"no setup given; give a file, --all, or names: {', '.join(setup_names())}")
+            listed = ", ".join([*setup_names(), *ROOMS])
+            raise ConfigError(f"no setup given; give a file, --all, or names: {listed}")
         setups = [named_setup(name) for name in names]
         made = ["identify.json", *(f"identify_{one.name}.png" for one in setups), "identify_setups.png"]
         refuse_existing(self.force, *(self.out / name for name in made if self.out))

@@ -1,11 +1,12 @@
 """Setups: wall, geometry, ambient light and cameras in one object, from names, files and measurements."""
 
 from evnlos.setups.base import Layout, OperatorNoise, Parameter, SensorSize, Setup, stated_distance_m
-from evnlos.setups.files import CALIBRATED_FILE, TRAINING_FILE, calibrated_file, calibrated_folder
+from evnlos.setups.files import CALIBRATED_FILE, TRAINING_FILE, calibrated_file
 from evnlos.setups.fitted import FittedSetup
 from evnlos.setups.load import (
     ROOMS,
     NamedSetup,
+    lit_setup,
     load_setup,
     named_setup,
     setup_names,
@@ -32,7 +33,7 @@ __all__ = [
     "SensorSize",
     "Setup",
     "calibrated_file",
-    "calibrated_folder",
+    "lit_setup",
     "load_setup",
     "named_setup",
     "setup_names",

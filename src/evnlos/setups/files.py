@@ -7,6 +7,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from evnlos.config import read_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.optics.facets import SlopeTable
+from evnlos.registry import migrate
 from evnlos.tensor_file import TensorFile, check_floats
 from evnlos.types import Plane
 
@@ -305,17 +309,32 @@ def same_setup(first: str, second: str) -> bool:
     return all(file.is_file() for file in files) and len({file.read_bytes() for file in files}) == 1
 
 
-def calibrated_folder(word: str | Path) -> Path:
-    """Return the folder that `calibrate` wrote, named by itself or by the settings file in it.
+def stated_setup(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """Return the settings of the setup in a file, and those of a lab that were drawn from its ranges.
+
+    Args:
+        path: YAML file with a setup, or with what holds one.
 
     Raises:
-        ConfigError: The word names no such folder.
+        ConfigError: The file holds no setup.
     """
-    path = Path(word)
-    folder = path.parent if path.name in (CALIBRATED_FILE, OLDER_FILE) else path
-    if calibrated_file(folder) == folder:
-        raise ConfigError(
-            f"--setup is {word}, which holds no {CALIBRATED_FILE}; give the folder that `calibrate` wrote for "
-            "this very setup (a name such as main-near knows neither its light nor its cameras), or none"
-        )
-    return folder
+    values = read_yaml(path)
+    drawn: Mapping[str, Any] = {}
+    if isinstance(values.get("lab"), dict):
+        known = values.get("drawn")
+        drawn = known if isinstance(known, dict) else {}
+        values = values["lab"]
+    elif isinstance(values.get("config"), dict):
+        values = values["config"]
+    if "kind" not in values:
+        values = migrate("Simulation", values)
+        if "setup" not in values:
+            near = difflib.get_close_matches("setup", [str(key) for key in values], n=1)
+            hint = f"; perhaps {near[0]!r} is meant to be it" if near else ""
+            raise ConfigError(
+                f"{path} has no `setup`; give settings of `evnlos simulate` or `evnlos lab`, or a setup{hint}"
+            )
+        values = values["setup"]
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: setup is {values!r}; give a mapping with the kind of the setup")
+    return values, drawn

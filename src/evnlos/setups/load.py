@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,12 +24,11 @@ from evnlos.cameras import (
     ReadoutPixel,
     V2ePixel,
 )
-from evnlos.config import from_dict, read_yaml
+from evnlos.config import from_dict
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.lab import Lobe, Mount, Reflection, Torch
-from evnlos.registry import migrate
 from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup
-from evnlos.setups.files import CALIBRATED_FILE, OLDER_FILE, calibrated_file
+from evnlos.setups.files import CALIBRATED_FILE, OLDER_FILE, calibrated_file, stated_setup
 from evnlos.setups.measured import MeasuredSetup
 from evnlos.setups.paper import as_in_the_paper, rough_paper
 from evnlos.setups.radiometric import RadiometricSetup
@@ -282,6 +281,7 @@ NAMED: dict[str, Callable[[], Setup]] = {
     },
 }
 """Setups by name: walls with -near or -far, rooms, and the setups of the presets of `evnlos simulate`."""
+_NAMES = f"a wall ({', '.join(_WALLS)}, with -near or -far), a room ({', '.join(ROOMS)})"
 
 
 _TOLD_BY_FOLDER = ("setup", "training", "transport", "rig", "lab", "dataset")  # a folder has one of each
@@ -297,12 +297,15 @@ def load_setup(word: str | Path) -> Setup:
             written); a folder that `evnlos calibrate` wrote; or the .safetensors file of `evnlos scan import`.
 
     Raises:
-        ConfigError: There is no such name and no such file, or the file holds no setup.
+        ConfigError: The word is empty or no text, there is no such name and no such file, or the file holds
+            no setup.
 
     Example:
         >>> load_setup("hard-far").distance_m
         0.5
     """
+    if not isinstance(word, str | Path) or not str(word).strip():
+        raise ConfigError(f"the setup is {word!r}; give {_NAMES}, a settings file or a folder")
     path = calibrated_file(Path(word))
     if path.suffix == SUFFIX:
         measured = MeasuredSetup(file=str(path))
@@ -314,8 +317,7 @@ def load_setup(word: str | Path) -> Setup:
             f"{word} holds no {CALIBRATED_FILE}; give the folder that `calibrate` wrote, a file or a name"
         )
     if path.suffix in (".yaml", ".yml"):
-        cure = f"give a settings file or one of {', '.join(setup_names())}"
-        raise UnknownNameError(f"{path} does not exist; {cure}")
+        raise UnknownNameError(f"{path} does not exist; give {_NAMES}, a settings file or a folder")
     return _named(str(word))
 
 
@@ -341,6 +343,24 @@ def is_name(word: str | Path) -> bool:
     return str(word) in NAMED and not Path(word).exists()
 
 
+def lit_setup(word: str | Path) -> Setup:
+    """Return `load_setup(word)` where it states the light and the cameras of a recording.
+
+    Args:
+        word: As for `load_setup`.
+
+    Raises:
+        ConfigError: As for `load_setup`, or the word names a wall, whose light and cameras are defaults.
+    """
+    setup = load_setup(word)
+    if is_name(word) and not setup.is_lit:
+        raise ConfigError(
+            f"--setup {word} states neither the light nor the cameras of a recording; give the folder that "
+            f"`calibrate` wrote for this very setup, a settings file, a room ({', '.join(ROOMS)}), or none"
+        )
+    return setup
+
+
 def setup_name(word: str | Path) -> str:
     """Return what a page or a table calls the setup of a word: its name, or that of its folder or file."""
     path = calibrated_file(Path(word))
@@ -363,34 +383,16 @@ def setup_word(word: str | Path) -> str:
 def _named(name: str) -> Setup:
     if name in NAMED:
         return NAMED[name]()
+    near = difflib.get_close_matches(name, NAMED, n=1)
+    hint = f"; perhaps you meant {near[0]!r}" if near else ""
     if name.startswith("simulate-"):
-        presets = [one for one in NAMED if one.startswith("simulate-")]
-        near = difflib.get_close_matches(name, presets, n=1)
-        hint = f"; perhaps you meant {near[0]!r}" if near else ""
-        raise UnknownNameError(f"simulate has no preset {name[9:]!r}; give one of {', '.join(presets)}{hint}")
-    return setup_preset(name)  # which refuses it
+        presets = ", ".join(one for one in NAMED if one.startswith("simulate-"))
+        raise UnknownNameError(f"simulate has no preset {name[9:]!r}; give one of {presets}{hint}")
+    raise UnknownNameError(f"the setup {name!r} is unknown; give {_NAMES}, a settings file or a folder{hint}")
 
 
 def _in_file(path: Path) -> Setup:
-    values = read_yaml(path)
-    drawn: Mapping[str, Any] = {}
-    if isinstance(values.get("lab"), dict):
-        known = values.get("drawn")
-        drawn = known if isinstance(known, dict) else {}
-        values = values["lab"]
-    elif isinstance(values.get("config"), dict):
-        values = values["config"]
-    if "kind" not in values:
-        values = migrate("Simulation", values)
-        if "setup" not in values:
-            near = difflib.get_close_matches("setup", [str(key) for key in values], n=1)
-            hint = f"; perhaps {near[0]!r} is meant to be it" if near else ""
-            raise ConfigError(
-                f"{path} has no `setup`; give settings of `evnlos simulate` or `evnlos lab`, or a setup{hint}"
-            )
-        values = values["setup"]
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: setup is {values!r}; give a mapping with the kind of the setup")
+    values, drawn = stated_setup(path)
     # A lab's sensor is drawn once; what was drawn stands beside the ranges.
     values = {**values, **{name: drawn[name] for name in CAMERA_FIELDS if name in drawn}}
     return from_dict(Setup, values, source=str(path), folder=path.parent)  # type: ignore[type-abstract] - its kind is concrete
