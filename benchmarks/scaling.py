@@ -37,7 +37,9 @@ OBJECTS, NODES = 1_000_000, 100
 BASE = Simulation(
     glyphs=HandwritingGlyphs(characters="ABCEFHLT", writers=2),
     setup=PaperSetup(
-        field_of_view_m=0.585, gain=2.0, pixel=EventPixel(leak_rate_hz=0.0, shot_noise_rate_hz=0.0)
+        field_of_view_m=0.585,
+        gain=2.0,
+        pixel=EventPixel(leak_rate_hz=0.0, shot_noise_rate_hz=0.0, initial_phase="rest"),
     ),
     duration_s=2.0,
     positions=10,

@@ -19,7 +19,7 @@ for k, time_s in enumerate(times_s):
     left = np.exp(-((x - 58 + 200 * time_s) ** 2 + (y - 12) ** 2) / (2 * 3**2))
     frames[k] = 40 + 150 * right + 100 * left
 
-pixel = EventPixel(leak_rate_hz=0, shot_noise_rate_hz=0)
+pixel = EventPixel(leak_rate_hz=0, shot_noise_rate_hz=0, initial_phase="rest")
 streams = {
     'mode="v2e"': simulate_events(frames, times_s, pixel, mode="v2e"),
     'mode="exact"': simulate_events(frames, times_s, pixel, mode="exact"),

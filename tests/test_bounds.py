@@ -55,7 +55,10 @@ def light() -> SequenceLight:
 
 def law(**changes: float) -> CrossingLaw:
     return replace(
-        EventPixel(0.1, 0.12, 0.02, leak_rate_hz=0.0, shot_noise_rate_hz=0.0).crossing_law(), **changes
+        EventPixel(
+            0.1, 0.12, 0.02, leak_rate_hz=0.0, shot_noise_rate_hz=0.0, initial_phase="rest"
+        ).crossing_law(),
+        **changes,
     )
 
 
@@ -190,7 +193,7 @@ def test_predicted_events_against_a_slow_reference(light: SequenceLight) -> None
 
 def test_the_pixels_own_events_lie_a_threshold_apart(light: SequenceLight) -> None:
     """The levels are those of the continuous pixel, filter and knee included."""
-    pixel = EventPixel(0.1, 0.12, 0.0, 30.0, 0.0, 0.0)
+    pixel = EventPixel(0.1, 0.12, 0.0, 30.0, 0.0, 0.0, initial_phase="rest")
     z = 0.3 * np.ones(6)
     seen = light(z)
     frames = (255 * seen.T.reshape(-1, *light.shape)).astype(np.float32)

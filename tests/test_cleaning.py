@@ -174,9 +174,15 @@ def lamps() -> tuple[Events, np.ndarray]:
     y, x = np.mgrid[:32, :48]
     disc = 40 + 120 / (1 + np.exp(np.hypot(x - 8 - 14 * times[:, None, None], y - 16) - 6))
     ripple = np.where(x < 12, 0.15, 0.0) * np.sin(2 * np.pi * 100.4 * times)[:, None, None]
-    signal = simulate_events(disc.astype(np.float32), times, EventPixel(0.1, 0.12, 0.02, 0, 0, 0), seed=1)
+    pixels = [
+        EventPixel(on, 0.12, sigma, 0, 0, 0, initial_phase="rest") for on, sigma in ((0.1, 0.02), (0.12, 0.01))
+    ]
+    signal = simulate_events(disc.astype(np.float32), times, pixels[0], seed=1)
     flicker = simulate_events(
-        (90 * (1 + ripple)).astype(np.float32), times, EventPixel(0.12, 0.12, 0.01, 0, 0, 0), seed=2
+        (90 * (1 + ripple)).astype(np.float32),
+        times,
+        pixels[1],
+        seed=2,
     )
     draw, count = np.random.default_rng(3), 3000
     noise = Events(

@@ -17,7 +17,7 @@ from evnlos.optics import SlidingWall, View
 from evnlos.scene import LineMotion
 from evnlos.types import Plane
 
-CLEAN = EventPixel(0.15, 0.15, 0.0, 15.0, 0.0, 0.0, 0.0)
+CLEAN = EventPixel(0.15, 0.15, 0.0, 15.0, 0.0, 0.0, 0.0, initial_phase="rest")
 
 
 @dataclass(frozen=True)

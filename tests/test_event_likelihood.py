@@ -191,7 +191,7 @@ def test_it_stays_at_the_truth() -> None:
 
 
 def test_a_pixel_without_noise_shows_nearly_everything() -> None:
-    ideal = EventPixel(0.12, 0.14, 0.0, 0.0, 0.0, 0.0)
+    ideal = EventPixel(0.12, 0.14, 0.0, 0.0, 0.0, 0.0, initial_phase="rest")
     settings = LikelihoodSettings(least_noise=EXACT)
     found = estimate_sequence(light(), prior(), ideal.crossing_law(), recorded(0, ideal), settings=settings)
     assert found.noise == pytest.approx(0.003, rel=0.1)

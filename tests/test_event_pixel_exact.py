@@ -1,6 +1,7 @@
 """The continuous-time pixel against closed forms, laws, its own fine runs, and brute force."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from evnlos.cameras.pixels.continuous_math import (
 )
 from evnlos.cameras.random_numbers import cos_turns, fast_exp, fast_log
 from evnlos.cameras.streams import sort_times
+from evnlos.errors import ConfigError
 
-QUIET = {"threshold_sigma": 0.0, "leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0}
+QUIET = {"threshold_sigma": 0.0, "leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0, "initial_phase": "rest"}
 
 
 def _column(values):
@@ -171,7 +173,9 @@ def test_constant_light_gives_no_events():
 def test_brightness_scale_changes_no_event_above_the_knee(mode):
     times = np.linspace(0, 0.2, 101)
     video = _spot(times, speed=200.0)
-    pixel = EventPixel(threshold_sigma=0.03, cutoff_hz=0, leak_rate_hz=0, shot_noise_rate_hz=0)
+    pixel = EventPixel(
+        threshold_sigma=0.03, cutoff_hz=0, leak_rate_hz=0, shot_noise_rate_hz=0, initial_phase="rest"
+    )
     base = simulate_events(video, times, pixel, mode=mode, seed=4)
     for factor in (0.75, 2.0, 7.3):
         assert simulate_events(factor * video, times, pixel, mode=mode, seed=4) == base
@@ -220,7 +224,9 @@ def test_leak_has_its_rate_from_the_first_moment():
 @pytest.mark.parametrize("level", [0.0, 100.0, 255.0])
 def test_shot_noise_has_its_rate_and_is_poisson(level):
     times = np.linspace(0, 1.0, 11)
-    pixel = EventPixel(threshold_sigma=0, cutoff_hz=15, leak_rate_hz=0, shot_noise_rate_hz=8.0)
+    pixel = EventPixel(
+        threshold_sigma=0, cutoff_hz=15, leak_rate_hz=0, shot_noise_rate_hz=8.0, initial_phase="rest"
+    )
     events = simulate_events(np.full((11, 80, 100), level), times, pixel, seed=3)
     expected = 8.0 * (1 - 0.75 * (level + 20) / 275) * 8000
     assert abs(len(events) - expected) < 4 * math.sqrt(expected)
@@ -423,3 +429,10 @@ def test_events_are_put_in_order_of_time_pixel_and_polarity(count: int, span: in
     rank = np.lexsort((on, pixel, time))
     for found, column in zip(sort_times(time, pixel, on), (time, pixel, on), strict=True):
         np.testing.assert_array_equal(found, column[rank])
+
+
+def test_the_first_state_is_a_setting_of_its_own() -> None:
+    assert {EventPixel(leak_rate_hz=leak).initial_phase for leak in (0.0, 0.01)} == {"random"}
+    assert replace(EventPixel(initial_phase="rest"), leak_rate_hz=1.0).initial_phase == "rest"
+    with pytest.raises(ConfigError, match="initial_phase is None"):
+        EventPixel(initial_phase=None)  # type: ignore[arg-type]

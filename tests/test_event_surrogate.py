@@ -29,7 +29,9 @@ def _light(seed, steps=1501, height=4, width=6, span_s=0.6, swing=0.8):
 
 
 def _pixel(on, off, cutoff):
-    return EventPixel(on, off, threshold_sigma=0, cutoff_hz=cutoff, leak_rate_hz=0, shot_noise_rate_hz=0)
+    return EventPixel(
+        on, off, threshold_sigma=0, cutoff_hz=cutoff, leak_rate_hz=0, shot_noise_rate_hz=0, initial_phase="rest"
+    )
 
 
 def _count(events, edges_us):

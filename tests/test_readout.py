@@ -18,7 +18,7 @@ from evnlos.cameras import (
 )
 from evnlos.errors import ConfigError
 
-QUIET = EventPixel(0.1, 0.1, 0.02, 0.0, 0.0, 0.0)
+QUIET = EventPixel(0.1, 0.1, 0.02, 0.0, 0.0, 0.0, initial_phase="rest")
 TIMES_S = np.linspace(0.0, 0.02, 41)
 
 
@@ -185,7 +185,7 @@ class Flat:
 
 def test_a_rippling_lamp_makes_as_many_events_as_its_contrast_says() -> None:
     """2 ln((1 + c) / (1 - c)) / theta events a cycle and pixel, less the fractions of a threshold."""
-    pixel = EventPixel(0.02, 0.02, 0.0, 0.0, 0.0, 0.0)
+    pixel = EventPixel(0.02, 0.02, 0.0, 0.0, 0.0, 0.0, initial_phase="rest")
     for contrast in (0.2, 0.5):
         events = EventCamera(pixel).record(FlickeringWall(Flat(), contrast, 100.0), 0.0, 0.2)
         cycle = len(events.between(100_000, 200_000)) / 12 / 10

@@ -9,7 +9,7 @@ from event_pixel_reference import reference_exact
 from evnlos.cameras import EventCamera, EventPixel, simulate_events
 from evnlos.errors import ConfigError
 
-QUIET = EventPixel(0.2, 0.2, 0.0, 0.0, 0.0, 0.0, logarithm="true")
+QUIET = EventPixel(0.2, 0.2, 0.0, 0.0, 0.0, 0.0, logarithm="true", initial_phase="rest")
 
 
 @pytest.mark.parametrize("dark_dn", [0.0025, 0.5])

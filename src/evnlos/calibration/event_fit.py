@@ -110,7 +110,7 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     pixel, values = _match(recordings, regions, observed, replace(pixel, cutoff_hz=cutoff), seed, 2)
     error = _errors(recordings, regions, pixel, values, seed)
     if pixel.leak_rate_hz < error["leak_rate_hz"]:
-        pixel = replace(pixel, leak_rate_hz=0.0, initial_phase=None)  # not told from none: at rest at first
+        pixel = replace(pixel, leak_rate_hz=0.0, initial_phase="rest")  # not told from none: at rest at first
     edge = tuple(
         n for n in ("threshold_on", "threshold_off") if math.log(getattr(pixel, n)) > _HIGHEST[0] - 0.02
     )
@@ -175,7 +175,8 @@ def _with(pixel: EventPixel, values: NDArray[np.float64]) -> EventPixel:
         name: float(v) if name not in _LOG_NAMES else math.exp(v)
         for name, v in zip(_NAMES, values, strict=True)
     }
-    return replace(pixel, **chosen, initial_phase=None)  # at rest at first where nothing leaks
+    phase = "random" if chosen["leak_rate_hz"] > 0 else "rest"
+    return replace(pixel, **chosen, initial_phase=phase)
 
 
 def _values(pixel: EventPixel) -> list[float]:

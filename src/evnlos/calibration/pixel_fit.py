@@ -271,7 +271,7 @@ def fit_candidate(
         if one.state == "at most" and one.name in _MAY_BE_NONE[1:]:
             pixel = replace(pixel, **{one.name: 0.0})  # type: ignore[type-var]
     if isinstance(pixel, EventPixel):
-        pixel = replace(pixel, initial_phase=None)
+        pixel = replace(pixel, initial_phase="random" if pixel.leak_rate_hz > 0 else "rest")
     on, off, ratio = (value_of(one, draws[:, k]) for k, one in enumerate(free[:3]))
     low, middle, high = (float(q) for q in np.quantile(ratio * 0.5 * (on + off), (0.025, 0.5, 0.975)))
     estimates += (Estimate("threshold_sigma", middle, low, high, estimates[2].state),)

@@ -182,7 +182,7 @@ def simulate_events(
     Example:
         >>> times_s = np.linspace(0.0, 0.1, 11)
         >>> frames = 50.0 * np.exp(5.0 * times_s)[:, None, None] * np.ones((1, 1))
-        >>> pixel = EventPixel(threshold_sigma=0, cutoff_hz=0, leak_rate_hz=0, shot_noise_rate_hz=0)
+        >>> pixel = EventPixel(0.15, 0.15, 0, 0, 0, 0, initial_phase="rest")
         >>> simulate_events(frames, times_s, pixel).t_us // 1000
         array([30, 60, 90])
     """

@@ -80,10 +80,9 @@ class EventPixel(_ContrastPixel):
         hot_pixel_fraction: Fraction of pixels that fire without cause, 0 to 1 (`mode="exact"` only).
         hot_pixel_rate_hz: Rate of events of a hot pixel, ON and OFF together, hertz (`mode="exact"` only).
         jitter_s: Standard deviation of the time stamps, seconds (`mode="exact"` only).
-        initial_phase: State before the first frame (`mode="exact"` only): "random" = each pixel somewhere
-            between two events of the leak, "rest" = each as if it had just sent one. None, the default, stands
-            for "random" where the pixel leaks and "rest" where it does not, and is settled when the settings
-            are made: changing the leak afterwards does not change it.
+        initial_phase: State before the first frame (`mode="exact"` only): "random" = the reference of each
+            pixel somewhere between two ON events, "rest" = each as if it had just sent one. No other setting
+            changes it, the leak neither.
         pattern_seed: Seed of what belongs to the sensor: thresholds, leak rates, hot pixels. With it they stay
             from recording to recording; None draws them anew from the seed of each recording.
         logarithm: "lin-log" = ln I above 20 DN and a line below, as v2e has it; "true" = ln(I + dark_dn), as a
@@ -98,7 +97,7 @@ class EventPixel(_ContrastPixel):
 
     Example:
         >>> EventPixel(threshold_on=0.2).initial_phase, EventPixel(leak_rate_hz=0).initial_phase
-        ('random', 'rest')
+        ('random', 'random')
     """
 
     hot_pixel_fraction: float = 0.0
@@ -107,7 +106,7 @@ class EventPixel(_ContrastPixel):
     """Rate of events of a hot pixel, hertz (mode "exact" only)."""
     jitter_s: float = 0.0
     """Standard deviation of the time stamps, seconds (mode "exact" only)."""
-    initial_phase: Phase | None = None
+    initial_phase: Phase = "random"
     """State before the first frame: random = between two events, rest = just after one (mode "exact" only)."""
     pattern_seed: int | None = None
     """Seed of thresholds, leak rates, hot pixels: one sensor for all recordings; None = a new one for each."""
@@ -127,8 +126,6 @@ class EventPixel(_ContrastPixel):
         require(self, "hot_pixel_rate_hz", 0.0, math.inf, "hertz; 0 switches it off")
         require(self, "jitter_s", 0.0, math.inf, "seconds; 0 switches it off")
         require(self, "hot_pixel_fraction", 0.0, 1.0, "a fraction; 0 switches it off")
-        if self.initial_phase is None:
-            object.__setattr__(self, "initial_phase", "random" if self.leak_rate_hz > 0 else "rest")
         check_phase(self.initial_phase)
         check_pattern_seed(self.pattern_seed)
         if self.logarithm not in get_args(Logarithm):

@@ -54,7 +54,7 @@ def paper() -> EventPixel:
 
 def v2e_clean() -> EventPixel:
     """Return v2e's parameter set "clean": no noise, no filter, slight mismatch (v2e, `set_dvs_params`)."""
-    return EventPixel(0.2, 0.2, 0.02, 0.0, 0.0, 0.0, 0.0)
+    return EventPixel(0.2, 0.2, 0.02, 0.0, 0.0, 0.0, 0.0, initial_phase="rest")
 
 
 def v2e_noisy() -> EventPixel:

@@ -184,7 +184,7 @@ def video_events(
 
     Example:
         >>> flash = [(0.0, np.full((2, 2), 50.0)), (0.1, np.full((2, 2), 100.0))]
-        >>> quiet = EventPixel(threshold_sigma=0, cutoff_hz=0, leak_rate_hz=0, shot_noise_rate_hz=0)
+        >>> quiet = EventPixel(0.15, 0.15, 0, 0, 0, 0, initial_phase="rest")
         >>> sum(len(piece) for piece in video_events(flash, quiet))
         16
     """

@@ -18,7 +18,7 @@ import tyro
 from numpy.typing import NDArray
 
 from evnlos.cameras.event_model import Phase, PixelSettings
-from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
+from evnlos.cameras.pixel import Logarithm, Mode
 from evnlos.cameras.sensors import load_pixel
 from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
 from evnlos.cli.parsing import check_files, refuse_existing, say
@@ -70,8 +70,7 @@ class PixelChanges:
     jitter_s: float | None = None
     """Standard deviation of the time stamps, seconds (mode exact only)."""
     initial_phase: Phase | None = None
-    """State before the first frame: random = between two events, rest = just after one; by default random with
-    leak, rest without (mode exact only)."""
+    """State before the first frame: random = between two events, rest = just after one (mode exact only)."""
     pattern_seed: int | None = None
     """Seed of thresholds, leak rates and hot pixels: one sensor for all recordings."""
     logarithm: Logarithm | None = None
@@ -94,8 +93,6 @@ class PixelChanges:
         if unknown := sorted(changes.keys() - known):
             flag = "--pixel." + unknown[0].replace("_", "-")
             raise ConfigError(f"{flag} is nothing that a {type(pixel).__name__} has; leave it out")
-        if "leak_rate_hz" in changes and isinstance(pixel, EventPixel):
-            changes.setdefault("initial_phase", None)  # settled anew
         return replace(pixel, **changes)  # type: ignore[type-var]
 
 
