@@ -174,6 +174,9 @@ def doubts_of(one: LitEvents) -> list[str]:
 
     Constant light whose event rate varies much more than Poisson counts in twentieths of the recording, and a
     line at 100 or 120 Hz, which lamps on the mains make.
+
+    Args:
+        one: Events with the light that is stated.
     """
     found, time_s = [], one.events.t_us * 1e-6
     count = len(time_s)

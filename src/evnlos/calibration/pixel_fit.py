@@ -219,20 +219,36 @@ def panels_of(recordings: Sequence[LitRecording], like: Panels | None = None) ->
 
 
 def value_of(free: Free, u: NDArray | float) -> Array:
-    """Return a free number at normal positions: its range is uniform on its own (logarithmic) scale."""
+    """Return a free number at normal positions: its range is uniform on its own (logarithmic) scale.
+
+    Args:
+        free: The number's range and scale.
+        u: Positions, standard normal, any shape.
+    """
     share = 0.5 * (1.0 + torch.erf(torch.as_tensor(np.asarray(u, np.float64)) / math.sqrt(2.0)).numpy())
     low, high = (math.log(free.low), math.log(free.high)) if free.log else (free.low, free.high)
     return np.exp(low + share * (high - low)) if free.log else low + share * (high - low)
 
 
 def position_of(free: Free, value: float) -> float:
-    """Return the normal position of a free number; inverse of `value_of`."""
+    """Return the normal position of a free number; inverse of `value_of`.
+
+    Args:
+        free: The number's range and scale.
+        value: Its value, within the range.
+    """
     low, high, at = (math.log(n) if free.log else n for n in (free.low, free.high, value))
     return NormalDist().inv_cdf(min(max((at - low) / (high - low), 1e-4), 1 - 1e-4))
 
 
 def pixel_at(start: PixelSettings, free: Sequence[Free], u: Array) -> PixelSettings:
-    """Return a pixel whose free numbers stand at normal positions u [P]."""
+    """Return a pixel whose free numbers stand at normal positions u [P].
+
+    Args:
+        start: Settings of the other numbers.
+        free: The free numbers, P of them.
+        u: Positions, standard normal, [P].
+    """
     changes: dict[str, Any] = {one.name: float(value_of(one, u[k])) for k, one in enumerate(free)}
     ratio = changes.pop(MISMATCH, None)
     if ratio is not None:

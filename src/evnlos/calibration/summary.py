@@ -136,7 +136,11 @@ def unit_of(name: str) -> str:
 
 
 def table(rows: list[Row]) -> str:
-    """Return the rows as a text table: parameter, before, after, standard error, unit."""
+    """Return the rows as a text table: parameter, before, after, standard error, unit.
+
+    Args:
+        rows: Parameters before and after.
+    """
     cells = [["parameter", "before", "after", "+-", "unit"]]
     for row in rows:
         error = "" if row.error is None else "unknown" if math.isinf(row.error) else f"{row.error:.2g}"
@@ -147,7 +151,11 @@ def table(rows: list[Row]) -> str:
 
 
 def residual_table(fit: SetupFit) -> str:
-    """Return the residuals as a text table, in per cent of the standard deviation of what the camera saw."""
+    """Return the residuals as a text table, in per cent of the standard deviation of what the camera saw.
+
+    Args:
+        fit: The calibration.
+    """
     cells = [["residual, % of standard deviation", "before", "after", "noise alone"]]
     for name, r in fit.residuals.items():
         cells.append([name, *(f"{100 * v:.1f}" for v in (r.before, r.after, r.noise))])
@@ -161,7 +169,11 @@ def _aligned(cells: list[list[str]]) -> str:
 
 
 def warnings_of(fit: SetupFit) -> list[str]:
-    """Return why a fit should not be believed as it stands, one line each; none where nothing was found."""
+    """Return why a fit should not be believed as it stands, one line each; none where nothing was found.
+
+    Args:
+        fit: The calibration.
+    """
     found, cure = [], f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
     if on_bound := fit.optics.on_bound:
         names = ", ".join(f"setup.{name} ({value:.4g})" for name, value in on_bound.items())
@@ -213,7 +225,11 @@ def _event_warnings(fit: SetupFit) -> list[str]:
 
 
 def expectation(fit: SetupFit) -> str:
-    """Return in one line what training on the calibrated simulation can be expected to bring."""
+    """Return in one line what training on the calibrated simulation can be expected to bring.
+
+    Args:
+        fit: The calibration.
+    """
     left = fit.residuals["frames held out, without pattern"]
     share, frames = 100 * left.unexplained, "frames"
     if not left.after < 1:
@@ -245,7 +261,12 @@ def _left(r: Residual) -> str:
 
 
 def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
-    """Return a calibration as plain values for JSON; an unknown error is null."""
+    """Return a calibration as plain values for JSON; an unknown error is null.
+
+    Args:
+        fit: The calibration.
+        rows: Parameters before and after.
+    """
     return {
         "evnlos": __version__,
         "fitted": list(fit.fitted),
