@@ -78,7 +78,14 @@ def ssim(
 
 
 def ssim_map(x: torch.Tensor, y: torch.Tensor, window: int = 11, sigma: float = 1.5) -> torch.Tensor:
-    """Return the SSIM at each position of the window: x, y [N, 1, H, W] in 0..1 -> [N, 1, H-w+1, W-w+1]."""
+    """Return the SSIM at each position of the window: x, y [N, 1, H, W] in 0..1 -> [N, 1, H-w+1, W-w+1].
+
+    Args:
+        x: Images in 0..1, [N, 1, H, W].
+        y: Images to compare them with, likewise.
+        window: Side w of the Gaussian window, pixels, at most H and W.
+        sigma: Its standard deviation, pixels.
+    """
     luminance, structure = ssim_terms(x, y, window, sigma)
     return luminance * structure
 

@@ -332,7 +332,12 @@ def colour_filters(mosaic: Mosaic, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def mosaicked(pictures: NDArray, mosaic: Mosaic) -> NDArray:
-    """Return what a sensor with colour filters has of coloured pictures [..., H, W, 3]: [..., H, W]."""
+    """Return what a sensor with colour filters has of coloured pictures [..., H, W, 3]: [..., H, W].
+
+    Args:
+        pictures: Coloured pictures (red, green, blue), of any unit, [..., H, W, 3].
+        mosaic: Pattern of the filters.
+    """
     seen = np.moveaxis(colour_filters(mosaic, pictures.shape[-3:-1]), 0, -1)  # type: ignore[arg-type]
     return np.where(seen, pictures, 0).sum(axis=-1, dtype=pictures.dtype)
 

@@ -32,13 +32,7 @@ from evnlos.data.sampling import (
 )
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, UnknownNameError, printable
-from evnlos.events import (
-    CelexOptions,
-    FrameStack,
-    keep_known_polarity,
-    read_events,
-    read_triggers,
-)
+from evnlos.events import CelexOptions, FrameStack, keep_known_polarity, read_events, read_triggers
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import LineMotion, Scene, SeveralTargets, Target
 from evnlos.types import Colour, Events, matching_paths
@@ -115,6 +109,9 @@ class Capture:
 
 def captures_in(given: Iterable[Path]) -> list[Path]:
     """Return the capture folders among some paths or patterns, and in folders among them; files are left out.
+
+    Args:
+        given: Paths, or patterns of names.
 
     Raises:
         UnknownNameError: A path does not exist, or there is no capture in any.

@@ -256,7 +256,12 @@ class FixedPattern:
 
 
 def save_pattern(pattern: FixedPattern, path: str | Path) -> None:
-    """Write a fixed pattern as a safetensors file, atomically."""
+    """Write a fixed pattern as a safetensors file, atomically.
+
+    Args:
+        pattern: Sensitivity and offset, [H, W] each.
+        path: File to write; its name ends in .safetensors.
+    """
     tensors = {"sensitivity": pattern.sensitivity, "offset": pattern.offset}
     content = {name: torch.tensor(value, dtype=torch.float32) for name, value in tensors.items()}
     write_atomically(Path(path), sealed_bytes(content, "fixed pattern"))

@@ -186,7 +186,11 @@ def as_modality(modality: str | Modality) -> Modality:
 
 
 def modality_order(name: str) -> int:
-    """Return where a modality stands in tables: in the order of the registry, an unknown one last."""
+    """Return where a modality stands in tables: in the order of the registry, an unknown one last.
+
+    Args:
+        name: Name of a modality, e.g. "fusion".
+    """
     names = list(MODALITIES)
     return names.index(name) if name in names else len(names)
 

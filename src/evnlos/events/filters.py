@@ -71,6 +71,10 @@ def crop_events(events: Events, x: int, y: int, width: int, height: int) -> Even
 def stride_for(pixels: int, enough: int) -> int:
     """Return of which so many rows and columns one leaves about `enough` of the pixels.
 
+    Args:
+        pixels: Number of pixels of the sensor.
+        enough: Pixels wanted, at least 1.
+
     Example:
         >>> stride_for(640 * 480, 40_000)
         3

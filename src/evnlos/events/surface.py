@@ -317,6 +317,19 @@ def iter_time_surfaces(
     """Yield what `time_surface` returns, `grids` at a time (None = all): memory does not grow with them.
 
     The other arguments, and the errors, are those of `time_surface`.
+
+    Args:
+        events: Events of one sensor.
+        edges_us: Ascending edges, [all grids + 1], microseconds.
+        tau_us: Time constant, microseconds, above 0.
+        mode: The kind of surface.
+        grids: Grids of a block, at least 1; None is all of them.
+        radius: Radius of the neighbourhood, pixels, 0 to 64.
+        shape: "box" or "disc".
+        border: "crop" or "zero", for "hots".
+        projection: "sum", "last" or "max" of the events of a pixel.
+        include_self: Whether an event finds itself.
+        carry: Whether earlier events count; else each grid starts blank.
     """
     edges = as_edges(edges_us)
     check_surface(tau_us, radius, mode)

@@ -240,6 +240,13 @@ def tikhonov_cv_error(
 
     It is in the squared unit of W y, and comparable between operators, priors and backgrounds for one
     measurement and weight. Arguments as in `tikhonov`.
+
+    Args:
+        operator: A, linear with an adjoint.
+        measurement: y [H, W], float32 or float64.
+        prior: L; None is the identity.
+        background_model: Background to project out.
+        weight: Factor on each sample's residual, [H, W].
     """
     problem = Problem(operator, measurement, background_model, weight)
     matrix, _ = standard_form(problem, prior)

@@ -268,6 +268,9 @@ def camera_axes(optics: Optics) -> tuple[Array, Array, Array, Array]:
 def cast(optics: Optics) -> Rays:
     """Return the rays of all pixels, row by row, with vignetting but without texture.
 
+    Args:
+        optics: Pixels, lens and pose of the camera.
+
     Raises:
         ConfigError: Part of the image does not see the wall.
     """

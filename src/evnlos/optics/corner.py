@@ -121,6 +121,9 @@ def edge_irradiance(
 def floor_bearing(points_m: ArrayLike) -> Array:
     """Return the bearing of floor points (x, y) [..., 2] about the edge, from the wall, radians, 0..2 pi.
 
+    Args:
+        points_m: Points of the floor (x, y) from the edge, metres, [..., 2].
+
     Example:
         >>> np.degrees(floor_bearing([[-1.0, -1e-9], [0.0, -1.0], [1.0, -1.0]])).round(1)
         array([  0.,  90., 135.])

@@ -169,6 +169,11 @@ def method_of(history: list[dict[str, Any]]) -> str:
 def refuse_seen(history: list[dict[str, Any]], dataset: Dataset, split: str) -> None:
     """Refuse to test on objects that a training saw.
 
+    Args:
+        history: The trainings that weights state.
+        dataset: The objects to test on.
+        split: Name of the split.
+
     Raises:
         DataError: Names an object that was trained on.
     """
@@ -181,7 +186,13 @@ def refuse_seen(history: list[dict[str, Any]], dataset: Dataset, split: str) -> 
 
 
 def seen_in_training(history: list[dict[str, Any]], dataset: Dataset, split: str) -> list[str]:
-    """Return the objects of a split that a training behind the weights saw, by origin and name."""
+    """Return the objects of a split that a training behind the weights saw, by origin and name.
+
+    Args:
+        history: The trainings that weights state.
+        dataset: The objects to test on.
+        split: Name of the split.
+    """
     tested = set(dataset.objects(split))
     steps = [step["data"] for step in history if step["data"]["origin"] == dataset.origin]
     trained = [set(data.get("train", ())) for data in steps]  # layers of many walls name no objects
@@ -245,7 +256,11 @@ def available_metrics(results: list[RunResult]) -> dict[str, tuple[str, str, int
 
 
 def to_csv(results: list[RunResult]) -> str:
-    """Return all metrics of all objects as CSV: metric, group, character, one column a method."""
+    """Return all metrics of all objects as CSV: metric, group, character, one column a method.
+
+    Args:
+        results: Runs of one dataset.
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(["metric", "group", "character", *columns_of(results)])
@@ -256,7 +271,12 @@ def to_csv(results: list[RunResult]) -> str:
 
 
 def to_text(results: list[RunResult], metric: str = "psnr_db") -> str:
-    """Return one metric's table as aligned text for a terminal."""
+    """Return one metric's table as aligned text for a terminal.
+
+    Args:
+        results: Runs of one dataset.
+        metric: Name of the metric.
+    """
     decimals = METRICS[metric][2]
     body: list[list[str]] = [["", *columns_of(results)]]
     for group, character, values in rows_of(results, metric):

@@ -115,7 +115,15 @@ def read_sd19(
     first: int = 0,
     count: int | None = None,
 ) -> Iterator[Handwritten]:
-    """Yield the scanned characters that `list_sd19` lists, one image in memory at a time."""
+    """Yield the scanned characters that `list_sd19` lists, one image in memory at a time.
+
+    Args:
+        folder: The folder `by_class`, or the one that holds it.
+        characters: Characters to read.
+        partition: "hsf_0" .. "hsf_8", or "train".
+        first: How many of each character are passed over, at least 0.
+        count: How many of each character follow; None is all.
+    """
     for char, source, path in list_sd19(folder, characters, partition, first, count):
         yield Handwritten(char, source, read_sd19_image(path))
 
@@ -212,7 +220,16 @@ def read_emnist(
     first: int = 0,
     count: int | None = None,
 ) -> Iterator[Handwritten]:
-    """Yield the characters that `list_emnist` lists, in the order of the file, in bounded memory."""
+    """Yield the characters that `list_emnist` lists, in the order of the file, in bounded memory.
+
+    Args:
+        folder: Folder with the official files, as for `list_emnist`.
+        characters: Characters to read.
+        subset: "byclass", "bymerge", "balanced", "letters" or "digits".
+        part: "train" or "test".
+        first: How many of each character are passed over, at least 0.
+        count: How many of each character follow; None is all.
+    """
     chars = {number: char for char, number in list_emnist(folder, characters, subset, part, first, count)}
     for number, mask in read_emnist_images(folder, list(chars), subset, part):
         yield Handwritten(chars[number], f"{part}_{number:06d}", mask)

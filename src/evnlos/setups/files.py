@@ -288,6 +288,9 @@ OLDER_FILE = "rig.yaml"  # its name in folders of before
 def calibrated_file(path: Path) -> Path:
     """Return the settings file of a folder that `calibrate` wrote; any other path stays as it is.
 
+    Args:
+        path: Folder or file.
+
     Example:
         >>> str(calibrated_file(Path("setup.yaml")))
         'setup.yaml'

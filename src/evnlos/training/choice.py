@@ -67,7 +67,11 @@ class Choice:
 
 
 def alternatives(settings: Training) -> tuple[Training, ...]:
-    """Return fine-tunings around one: itself, slower and quicker ones, with the normalization kept or not."""
+    """Return fine-tunings around one: itself, slower and quicker ones, with the normalization kept or not.
+
+    Args:
+        settings: The fine-tuning to vary.
+    """
     rate, keeps = settings.learning_rate, settings.keep_normalization
     slower = replace(settings, learning_rate=rate / 5, keep_normalization=True)
     quicker = replace(settings, learning_rate=rate * 5, keep_normalization=False)
@@ -155,7 +159,11 @@ def best_shown(datasets: Sequence[Dataset], weights: str | Path) -> Dataset:
 
 
 def read_choice(run: str | Path) -> Choice | None:
-    """Return what was chosen for a run, or None where nothing was to be chosen."""
+    """Return what was chosen for a run, or None where nothing was to be chosen.
+
+    Args:
+        run: Folder of the run.
+    """
     path = Path(run) / CHOICE
     return Choice(**json.loads(path.read_text())) if path.is_file() else None
 

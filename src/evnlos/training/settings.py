@@ -148,6 +148,10 @@ class Training:
 def learning_rate_at(settings: Training, progress: float) -> float:
     """Return Adam's step size after `progress` epochs (a fraction within an epoch is allowed).
 
+    Args:
+        settings: Schedule and step size.
+        progress: Epochs done, 0 to `settings.epochs`.
+
     Example:
         >>> learning_rate_at(Training(epochs=10, learning_rate=1.0, schedule="step", step_epoch=5), 7.5)
         0.5
@@ -164,12 +168,20 @@ PLAIN_NETWORK = UNetConfig(width=24, depth=4, shuffle=2, scaling="picture", rank
 
 
 def finetuning(modality: str = "frame") -> Training:
-    """Return our fine-tuning after a simulation of any setup: smaller steps than those of a training."""
+    """Return our fine-tuning after a simulation of any setup: smaller steps than those of a training.
+
+    Args:
+        modality: "frame", "event" or "fusion".
+    """
     return Training(modality=modality, epochs=10, learning_rate=1e-3)
 
 
 def paper_pretraining(modality: str = "fusion") -> Training:
-    """Return the paper's pre-training: 200 epochs of Adam, 1e-4 for 100 then 5e-5, batch 16, L1 + 2/SSIM."""
+    """Return the paper's pre-training: 200 epochs of Adam, 1e-4 for 100 then 5e-5, batch 16, L1 + 2/SSIM.
+
+    Args:
+        modality: "frame", "event" or "fusion".
+    """
     return Training(
         modality=modality,
         epochs=200,
@@ -183,7 +195,11 @@ def paper_pretraining(modality: str = "fusion") -> Training:
 
 
 def paper_finetuning(modality: str = "fusion") -> Training:
-    """Return the paper's fine-tuning: from the pre-trained weights, 100 epochs at 1e-5, batch 16."""
+    """Return the paper's fine-tuning: from the pre-trained weights, 100 epochs at 1e-5, batch 16.
+
+    Args:
+        modality: "frame", "event" or "fusion".
+    """
     return Training(
         modality=modality, epochs=100, batch_size=16, learning_rate=1e-5, schedule="constant", loss="paper"
     )
@@ -318,6 +334,10 @@ def tell_of_threads(out: Path) -> None:
 
 def check_run(out: Path, about: dict[str, Any]) -> None:
     """Refuse a folder that is neither new nor of a run with the same settings and data.
+
+    Args:
+        out: Folder of the run.
+        about: Settings and data, as its file states them.
 
     Raises:
         DataError: It holds another run, or something else.
