@@ -18,7 +18,7 @@ from evnlos.data.capture_check import PUBLISHED, compare_published, content_dige
 from evnlos.data.lab import (
     SENSOR_SPREAD,
     Lab,
-    lab_preset,
+    lab_of,
     published_lab,
     render_captures,
 )
@@ -222,7 +222,7 @@ def test_the_documents_setup_file():
 
 @pytest.mark.parametrize("name", ["matte-near", "aperture-far"])
 def test_named_setups_render(name, tmp_path):
-    lab = lab_preset(name)
+    lab = lab_of(name)
     lab = dataclasses.replace(
         lab,
         setup=dataclasses.replace(dataclasses.replace(lab.setup, cell_m=0.01), sensor=SensorSize(24, 36)),
@@ -239,7 +239,7 @@ def test_named_setups_render(name, tmp_path):
 def test_all_names():
     assert setup_names()[:3] == ["mirror-near", "mirror-far", "easy-near"]
     for name in setup_names():
-        assert lab_preset(name).setup.gain == 0.7
+        assert lab_of(name).setup.gain == 0.7
     assert setup_preset("main-far").distance_m == 0.5
     assert setup_preset("main-far", 0.4).distance_m == 0.4
 

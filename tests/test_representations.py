@@ -15,7 +15,6 @@ from evnlos.events import (
     event_frame,
     event_histogram,
     event_trace,
-    normalise_surface,
     suggest_tau_us,
     threshold_ordinal_surface,
     time_surface,
@@ -156,19 +155,6 @@ def test_nothing_writes_into_the_events():
     threshold_ordinal_surface(events)
     for name, column in events.columns().items():
         np.testing.assert_array_equal(column, before[name])
-
-
-def test_normalisation():
-    surface = np.zeros((2, 2, 1, 2), np.float32)
-    surface[0, 0] = [[4.0, 0.0]]
-    surface[0, 1] = [[0.0, 2.0]]
-    kept = surface.copy()
-    np.testing.assert_array_equal(normalise_surface(surface, "signed")[0], [[[1.0, -0.5]]])
-    np.testing.assert_array_equal(normalise_surface(surface, "joint")[0], [[[1.0, 0.0]], [[0.0, 0.5]]])
-    assert not normalise_surface(surface)[1].any()
-    np.testing.assert_array_equal(surface, kept)
-    with pytest.raises(DataError):
-        normalise_surface(surface[:, :1])
 
 
 @pytest.mark.parametrize("seed", range(4))

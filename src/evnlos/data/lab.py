@@ -160,19 +160,6 @@ class Lab:
         return replace(varied(own, self.spread, self.seed, self.name), spread={})
 
 
-def lab_preset(name: str) -> Lab:
-    """Return the lab of a named setup, e.g. "main-near" (see `setup_preset`), in the lab's light.
-
-    Raises:
-        ConfigError: The name is unknown.
-
-    Example:
-        >>> lab_preset("aperture-far").setup.distance_m
-        0.5
-    """
-    return Lab(name=name, setup=in_the_lab(setup_preset(name)))
-
-
 def lab_of(word: str | Path, lab: Lab | None = None) -> Lab:
     """Return the lab with the setup of a word (see `load_setup`), and its name.
 

@@ -38,7 +38,6 @@ from .filters import stride_for as stride_for
 from .filters import thin_events as thin_events
 from .recording import EventWindows as EventWindows
 from .surface import iter_time_surfaces as iter_time_surfaces
-from .surface import normalise_surface as normalise_surface
 from .surface import time_surface as time_surface
 from .volume import edges_from_count as edges_from_count
 from .volume import edges_from_rate as edges_from_rate

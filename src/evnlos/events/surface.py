@@ -357,24 +357,3 @@ def iter_time_surfaces(
             else:
                 hots(*chosen, whole_area, newest, never, origin, out)
         yield out
-
-
-def normalise_surface(surface: NDArray, how: Literal["signed", "joint"] = "joint") -> NDArray[np.float32]:
-    """Return surfaces scaled to one maximum for both polarities; a blank surface stays blank.
-
-    Args:
-        surface: Surfaces [..., 2, H, W], not negative; not changed.
-        how: "signed" gives [..., 1, H, W] = (ON - OFF) / max|ON - OFF|, within -1..1; "joint" gives
-            [..., 2, H, W], both channels divided by the maximum over both, within 0..1.
-
-    Raises:
-        DataError: The shape has no two channels.
-    """
-    _choice("how", how, ("signed", "joint"))
-    if surface.ndim < 3 or surface.shape[-3] != 2:
-        raise DataError(f"surface has shape {surface.shape}; give [..., 2, H, W]")
-    values = surface.astype(np.float32)  # a copy
-    if how == "signed":
-        values = values[..., :1, :, :] - values[..., 1:, :, :]  # [..., 1, H, W]
-    largest = np.abs(values).max(axis=(-3, -2, -1), keepdims=True)
-    return np.divide(values, largest, out=np.zeros_like(values), where=largest > 0)
