@@ -286,8 +286,7 @@ def fit_candidate(
     for one in estimates:
         if one.state == "at most" and one.name in _MAY_BE_NONE[1:]:
             pixel = replace(pixel, **{one.name: 0.0})  # type: ignore[type-var]
-    if isinstance(pixel, EventPixel):
-        pixel = replace(pixel, initial_phase="random" if pixel.leak_rate_hz > 0 else "rest")
+    pixel = replace(pixel, initial_phase="random")  # type: ignore[type-var]  # as all that it is compared with
     on, off, ratio = (value_of(one, draws[:, k]) for k, one in enumerate(free[:3]))
     low, middle, high = (float(q) for q in np.quantile(ratio * 0.5 * (on + off), (0.025, 0.5, 0.975)))
     estimates += (Estimate("threshold_sigma", middle, low, high, estimates[2].state),)

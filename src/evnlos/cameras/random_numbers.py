@@ -7,7 +7,8 @@ Random numbers that are functions of (seed, stream, pixel, counter): no state, s
 The generator is the finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014; constants of Stafford's
 variant 13), chained over the four keys.
 
-- Noise with a memory: the covariance that a linear process settles at, and its factor, for numbers of that.
+- Noise with a memory: the covariance that a linear process settles at, its factor, for numbers of that, and
+  where the reference of a pixel that sees it stands after long constant light.
 - Electrons of a frame: shot noise and read noise of every pixel from numbers that depend on its keys only.
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -271,3 +273,127 @@ def fill_electrons(mean, offset, read_noise, seed, number, out):
             read = random_normals(seed, STREAM_PHOTONS, i, number)[1]
             count = few_electrons(mean[i], random_uniform(seed, STREAM_FEW_PHOTONS, i, number))
             out[i] = count + offset[i] + read_noise * read
+
+
+_PHASES = 32
+"""Places of the reference, between two events of one sign, for which its law is worked out."""
+_FAR, _PER_RMS = 30.0, 32
+"""Table of passage times: how far it goes, rms of the noise, and entries per rms."""
+_SELDOM = 8.0
+"""Swings of the noise, rms, that are too rare to move a reference."""
+_FORGETS_HZ = 1e-6
+"""Rate at which a reference forgets where it stood where neither leak nor noise ever moves it."""
+
+
+class Passage(NamedTuple):
+    """Times of a noise of rms 1 and correlation time 1, at -30 ... 30 rms."""
+
+    climb: NDArray[np.float64]  # mean time from the left end up to here
+    inverse: NDArray[np.float64]  # crossings of 0 per crossing of here, 1 below 0
+
+
+@cache
+def passage_times() -> Passage:
+    """Return the table: from a up to b, an Ornstein-Uhlenbeck noise needs climb(b) - climb(a) on average.
+
+    climb' = sqrt(2 pi) exp(x^2 / 2) Phi(x), Phi the normal distribution.
+    """
+    x = np.linspace(-_FAR, _FAR, int(2 * _FAR) * _PER_RMS + 1)
+    slope = np.array([math.sqrt(math.pi / 2) * math.exp(z * z / 2) * math.erfc(-z / math.sqrt(2)) for z in x])
+    climb = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]))]) / _PER_RMS
+    return Passage(climb, np.exp(np.maximum(x, 0.0) ** 2 / 2))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _at(table, x):
+    """Return a table's value at x rms, a line between two entries."""
+    place = (min(max(x, -_FAR), _FAR - 1e-9) + _FAR) * _PER_RMS
+    k = int(place)
+    return table[k] + (place - k) * (table[k + 1] - table[k])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _rate(a, b, slowest, table):
+    """Return the rate, per correlation time, at which noise that has been at `a` rms first comes up to `b`.
+
+    slowest  crossings of the middle per correlation time: noise that is smooth, or seen in steps, has few
+    """
+    if b >= _FAR:
+        return 1.0 / table.climb[-1]
+    return 1.0 / (_at(table.climb, b) - _at(table.climb, a) + _at(table.inverse, b) / slowest + 0.01)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def settled_reference(on, off, leak, pause, noise, rms, memory, middle, seed, table, out):
+    """Draw how far references stand above the settled level after long constant light, log units; fill `out`.
+
+    Two references a threshold apart share a phase. The noise takes a pixel from one to the other and back, a
+    pair of events, which moves the phase by what the thresholds differ, or by what the noise does in a
+    refractory period; the leak moves it evenly. The phase follows the stationary law of such steps, and the
+    pixel stands at the one of the two references that the noise met last.
+
+    on, off   thresholds, log units [N];  leak  log units per s;  pause  refractory period, s
+    noise     where the noise stands, log units [N]
+    rms, memory  its standard deviation, log units, and correlation time, s [N]
+    middle    its upward crossings of zero per s [N];  seed, table  of the draws, and `passage_times()`
+    """
+    fall, rise = np.empty(_PHASES), np.empty(_PHASES)  # rates from a phase to the next lower, next higher
+    back, skip = np.empty(_PHASES), np.empty(_PHASES)
+    upper, share = np.empty(_PHASES), np.empty(_PHASES)
+    for i in range(len(out)):
+        scale = max(rms[i], 1e-3 * on[i])
+        width, p, m = on[i] / _PHASES, on[i] / scale, off[i] / scale
+        drift, q, slowest = leak / width, 0.0, max(middle[i] * memory[i], 1e-9)
+        step = (p - m) * _PHASES / p
+        loose = -math.expm1(-2.0 * pause / memory[i]) * (scale / width) ** 2
+        for j in range(_PHASES):
+            low = -(j + 0.5) * p / _PHASES
+            high = low + p
+            up = _rate(low, high, slowest, table) / memory[i]
+            down = _rate(-high, m - high, slowest, table) / memory[i]
+            q = (q * drift + up) / (drift + up + down)
+            upper[j] = q
+            # and what comes of the lower one's swings below it, the upper one's above
+            pairs = down * q
+            if m - low < _SELDOM:
+                pairs += _rate(-low, m - low, slowest, table) / memory[i] * (1.0 - q)
+            if high + p < _SELDOM:
+                pairs += _rate(high, high + p, slowest, table) / memory[i] * q
+            spread = 0.5 * pairs * max(step * step, abs(step))
+            fall[j], rise[j] = drift + spread - 0.5 * pairs * step, spread + 0.5 * pairs * step
+            share[j] = pairs * loose + _FORGETS_HZ * _PHASES**2
+        for j in range(_PHASES):  # steps that refractory noise or forgetting takes lead to the noise's own law
+            n = (j + 1) % _PHASES
+            here, there = min(j + 0.5, _PHASES - j - 0.5), min(n + 0.5, _PHASES - n - 0.5)
+            gain = 0.5 * (here * here - there * there) * (p / _PHASES) ** 2
+            fall[j] += share[j] * math.exp(min(gain, 0.0))
+            rise[n] += share[n] * math.exp(min(-gain, 0.0))
+        # the stationary law of steps around a ring: one phase after another is taken out, and put back
+        back[_PHASES - 1], skip[_PHASES - 1] = fall[_PHASES - 1], rise[0]
+        for j in range(_PHASES - 1, 0, -1):  # back: from j to 0, skip: from 0 to j
+            leave = rise[j] + back[j]
+            if j > 1:
+                back[j - 1], skip[j - 1] = fall[j - 1] * back[j] / leave, skip[j] * rise[j] / leave
+            share[j] = leave
+        total = share[0] = 1.0
+        skip[1] += fall[0]
+        for j in range(1, _PHASES):
+            share[j] = (skip[j] + (share[j - 1] * fall[j - 1] if j > 1 else 0.0)) / share[j]
+            total += share[j]
+        left, j = random_uniform(seed, STREAM_LEAK_PHASE, i, 0) * total, 0
+        while j < _PHASES - 1 and left >= share[j]:
+            left -= share[j]
+            j += 1
+        low = -width * (j + min(left / share[j], 1.0))
+        # which of the two the noise met last, from where it stands; as in balance, but for what the leak leaves
+        met = _at(table.climb, noise[i] / scale) - _at(table.climb, -noise[i] / scale)
+        a, b = low / scale, low / scale + p
+        below = max(met - _at(table.climb, a) + _at(table.climb, -a), 0.0)
+        above = max(_at(table.climb, b) - _at(table.climb, -b) - met, 0.0)
+        below *= upper[j] * _rate(-b, -a, slowest, table)
+        above *= (1.0 - upper[j]) * _rate(a, b, slowest, table)
+        stand = low
+        if random_uniform(seed, STREAM_LEAK_PHASE, i, 1) * (below + above) < below:
+            stand += on[i]
+        stand += on[i] * max(math.floor((noise[i] - stand) / on[i]), 0.0)
+        out[i] = stand - off[i] * max(math.floor((stand - noise[i]) / off[i]), 0.0)

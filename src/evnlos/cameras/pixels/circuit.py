@@ -11,7 +11,7 @@ ga = kappa I_pr / U, R = V_A / (2 I_pr), A = ga R kappa, three voltages obey
 and a pixel sends an event where v_sf, in log units of light, has moved by a threshold since its last one
 (R. Graca and T. Delbruck, arXiv 2304.04706 and 2505.07386). Within a short step I is frozen; what the light
 does and what the noise does add, since the equations are linear. Both are advanced exactly, by the matrix
-exponential of the step for a table of currents; the noise starts in its stationary state.
+exponential of the step for a table of currents; noise and reference start in their stationary state.
 
 With `poles` 1, v_sf follows x with one time constant and carries one Ornstein-Uhlenbeck noise: that of the
 same mean lag, and that of the same variance and correlation time as the three equations have at each current,
@@ -46,14 +46,14 @@ from evnlos.cameras.pixels.arrays import check_tiling, map_shares, pixel_thresho
 from evnlos.cameras.random_numbers import (
     STREAM_CIRCUIT,
     STREAM_CIRCUIT_START,
-    STREAM_LEAK_PHASE,
     factor_of,
     fast_log,
     normal_field,
     normal_row,
+    passage_times,
     random_triple,
+    settled_reference,
     stationary,
-    uniform_field,
 )
 from evnlos.cameras.streams import Columns, Light, grown, joined, sort_times
 from evnlos.errors import ConfigError
@@ -344,8 +344,8 @@ class CircuitPixel(ThresholdPixel):
             nearly the same events of pixels that are slower than their follower, half the noise of others.
         leak_rate_hz: Rate of the leak's ON events, hertz per pixel.
         refractory_s: Time after an event in which the reference follows the light, seconds.
-        initial_phase: "rest" = the reference stands at the settled level, "random" = anywhere between the
-            thresholds.
+        initial_phase: "random" = noise and reference of long constant light, so that noise events come as
+            often at first as later; "rest" = the reference stands at the settled level.
         pattern_seed: Seed of the thresholds: one sensor for all recordings; None = a new one for each.
 
     Raises:
@@ -390,8 +390,8 @@ class CircuitPixel(ThresholdPixel):
     """Rate of the leak's ON events, hertz per pixel."""
     refractory_s: float = 0.0
     """Time after an event in which the reference follows the light, seconds."""
-    initial_phase: Phase = "rest"
-    """First state of the reference: rest = at the settled level, random = anywhere between the thresholds."""
+    initial_phase: Phase = "random"
+    """First state of the reference: random = that of long constant light, rest = at the settled level."""
     pattern_seed: int | None = None
     """Seed of the thresholds: one sensor for all recordings; None = a new one for each."""
     kind: Literal["circuit"] = "circuit"
@@ -520,9 +520,12 @@ class CircuitArray(EventModel):
             float(settings.refractory_s),
             np.uint64(seed),
         )
-        current = settings.dark_current_a * np.exp(LEVEL * np.arange(int(top / LEVEL) + 2))
-        self._m, self._rest, noise = settings.matrices(current)
+        levels = LEVEL * np.arange(int(top / LEVEL) + 2)
+        self._m, self._rest, noise = settings.matrices(settings.dark_current_a * np.exp(levels))
         self._covariance = stationary(self._m, noise)
+        self._lag, whole = -np.linalg.solve(self._m, self._rest[:, None])[:, 2, 0], self._covariance[:, 2, 2]
+        memory = -np.linalg.solve(self._m, self._covariance)[:, 2, 2] / np.maximum(whole, 1e-300)
+        self._memory = np.where(whole > 0, memory, self._lag)  # of the noise
         share = _STEP_SHARE if settings.poles == 3 else _POLE_SHARE
         self._longest = share * _THERMAL_V * settings.follower_f / settings.follower_a
         self._tables: dict[float, Table | Pole] = {}
@@ -546,32 +549,31 @@ class CircuitArray(EventModel):
 
     def _pole(self, h: float) -> Pole:
         """Return one step with one time constant each for response and noise."""
-        lag = -np.linalg.solve(self._m, self._rest[:, None])[:, 2, 0]
-        variance = self._covariance[:, 2, 2]
-        memory = -np.linalg.solve(self._m, self._covariance)[:, 2, 2] / np.maximum(variance, 1e-300)
-        memory = np.where(variance > 0, memory, lag)
-        kick = np.sqrt(-np.expm1(-2 * h / memory) * variance)
+        lag, memory = self._lag, self._memory
+        kick = np.sqrt(-np.expm1(-2 * h / memory) * self._covariance[:, 2, 2])
         return Pole(np.exp(-h / lag), -lag * np.expm1(-h / lag) / h, np.exp(-h / memory), kick)
+
+    def _crossings(self) -> NDArray[np.float64]:
+        """Return how often the follower's noise crosses its mean upwards, as steps see it, per second [L]."""
+        h, alike = self._longest, np.exp(-self._longest / self._memory)
+        if self.settings.poles == 3 and self._covariance.any():
+            decay = torch.matrix_exp(torch.from_numpy(self._m * h)).numpy()
+            alike = np.einsum("lj,lj->l", decay[:, 2], self._covariance[:, 2]) / self._covariance[:, 2, 2]
+        return np.arccos(alike) / (2 * math.pi * h)
 
     def start(self, frame: NDArray, time_s: float) -> None:
         """Let all pixels have settled to the first light, DN [N], their noise in its stationary state."""
-        count, pixel = len(frame), self._pixel
+        count, pixel, above = len(frame), self._pixel, np.zeros(len(frame))
         x = np.minimum(np.log1p(pixel.factor * frame.astype(np.float64)), pixel.top)
-        factor = factor_of(self._covariance)[np.rint(x / LEVEL).astype(np.int64)]
+        level = np.rint(x / LEVEL).astype(np.int64)
         normal = normal_field(pixel.seed, STREAM_CIRCUIT_START, 3 * count).reshape(count, 3)
-        reference = x.copy()
+        noise = np.einsum("nij,nj->ni", factor_of(self._covariance)[level], normal)
         if self.settings.initial_phase == "random":
-            place = uniform_field(pixel.seed, STREAM_LEAK_PHASE, count)
-            reference -= place * (pixel.on + pixel.off) - pixel.off
-        self._state = State(
-            x,
-            np.zeros((count, 3)),
-            np.einsum("nij,nj->ni", factor, normal),
-            reference,
-            np.full(count, -np.inf),
-            np.zeros(count, np.uint32),
-            np.zeros(count, np.int64),
-        )
+            swings = np.sqrt(self._covariance[:, 2, 2]), self._memory, self._crossings()
+            seen = noise[:, 2].copy(), *(part[level] for part in swings), pixel.seed, passage_times(), above
+            settled_reference(pixel.on, pixel.off, pixel.leak, pixel.refractory, *seen)
+        rest = np.full(count, -np.inf), np.zeros(count, np.uint32), np.zeros(count, np.int64)
+        self._state = State(x, np.zeros((count, 3)), noise, x + above, *rest)
         self._time = time_s
 
     def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
