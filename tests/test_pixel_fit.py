@@ -120,6 +120,9 @@ def test_the_command_writes_a_pixel_that_other_commands_take(folder, tmp_path, c
     assert set(values["maps"]["state"]) <= {"identified", "not identified"}
     pixel = load_yaml(PixelSettings, out / "pixel.yaml")
     assert pixel == load_pixel(str(out / "pixel.yaml"))
+    assert (
+        getattr(pixel, "pixel", pixel).initial_phase == "random"
+    )  # that of the simulations it was fitted with
     np.save(tmp_path / "video.npy", np.linspace(20, 200, 8)[:, None, None] * np.ones((8, 6, 6)))
     main(["events", str(tmp_path / "video.npy"), "--fps", "50", "--pixel", str(out / "pixel.yaml"),
           "--out", str(tmp_path / "e.npz")])  # fmt: skip

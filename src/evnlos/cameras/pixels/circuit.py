@@ -569,8 +569,8 @@ class CircuitArray(EventModel):
         normal = normal_field(pixel.seed, STREAM_CIRCUIT_START, 3 * count).reshape(count, 3)
         noise = np.einsum("nij,nj->ni", factor_of(self._covariance)[level], normal)
         if self.settings.initial_phase == "random":
-            swings = np.sqrt(self._covariance[:, 2, 2]), self._memory, self._crossings()
-            seen = noise[:, 2].copy(), *(part[level] for part in swings), pixel.seed, passage_times(), above
+            rms, rate = np.sqrt(self._covariance[level, 2, 2]), self._crossings()[level]
+            seen = noise[:, 2].copy(), rms, self._memory[level], rate, pixel.seed, passage_times(), above
             settled_reference(pixel.on, pixel.off, pixel.leak, pixel.refractory, *seen)
         rest = np.full(count, -np.inf), np.zeros(count, np.uint32), np.zeros(count, np.int64)
         self._state = State(x, np.zeros((count, 3)), noise, x + above, *rest)
