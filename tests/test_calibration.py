@@ -18,6 +18,7 @@ from PIL import Image
 from evnlos.calibration import (
     Calibration,
     Residual,
+    Shown,
     calibration_values,
     expectation,
     fit_setup,
@@ -41,7 +42,7 @@ from evnlos.data.simulate import SensorSize, Simulation, simulate_object
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import FrameTerm, handwritten_prior, sequence_light
 from evnlos.scene import FontGlyphs, pen_width
-from evnlos.setups import PaperSetup, RadiometricSetup
+from evnlos.setups import PaperSetup, RadiometricSetup, load_setup
 from evnlos.types import Events, Plane
 
 SETUP = RadiometricSetup(
@@ -563,10 +564,35 @@ def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:
         "--columns",
         16,
     ]
-    main([str(word) for word in [*words, "--wall", "formula"]])
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in [*words, "--wall", "formula"]])
     shown = capsys.readouterr()
-    assert "on the bound of the search" in shown.out
+    assert stop.value.code == 1 and (tmp_path / "setup" / "setup.yaml").exists()  # warned of, and nothing lost
+    assert "on the bound of the search" in shown.out and "ahead of end-to-end" not in shown.out
     assert any(line.startswith("warning: setup.") and "evnlos scan" in line for line in shown.err.splitlines())
+
+
+def test_nothing_is_promised_where_the_wall_shows_nothing(fit) -> None:
+    """Behind a matte wall frames fit to the noise, and every method must fail."""
+    for name, shows in (("matte-near", False), ("hard-far", True)):
+        shown = Shown.by(Simulation(setup=load_setup(name)))
+        assert shown is not None and (shown.gain_db > 1) == shows
+        one = replace(fit, shown=shown)
+        told = [line for line in warnings_of(one) if "expect little or nothing of any method" in line]
+        assert len(told) == (not shows) and ("ahead of end-to-end" in expectation(one)) == shows
+        assert ("expect little or nothing" in expectation(one)) != shows
+    assert fit.shown is not None and fit.shown.gain_db > 1
+
+
+def test_less_is_promised_of_doubted_frames_and_numbers_on_a_bound(fit) -> None:
+    assert "ahead of end-to-end" in expectation(fit)
+    assert "only fine-tuned networks" in expectation(replace(fit, frame_doubt=100.0))
+    parameters = tuple(
+        replace(p, low=values_of(fit.optics.setup)[p.name]) if p.name == "roughness" else p
+        for p in fit.optics.parameters
+    )
+    stuck = replace(fit, optics=replace(fit.optics, parameters=parameters))
+    assert "ended on the bound of the search" in expectation(stuck)
 
 
 def test_a_cutoff_with_which_most_of_those_tried_agree_is_not_identified(fit) -> None:

@@ -8,6 +8,7 @@ from .event_fit import fit_pixel as fit_pixel
 from .event_fit import write_event_errors as write_event_errors
 from .fit import Example as Example
 from .fit import SetupFit as SetupFit
+from .fit import Shown as Shown
 from .fit import fit_setup as fit_setup
 from .frame_model import FrameModel as FrameModel
 from .frame_model import FrameNoise as FrameNoise

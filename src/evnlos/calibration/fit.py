@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.analysis.identify import QUICK, identify
 from evnlos.calibration.blind_calibration import fit_blind
 from evnlos.calibration.captures import Calibration, CaptureSet, read_capture_set
 from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
@@ -63,6 +64,29 @@ class Example:
 
 
 @dataclass(frozen=True)
+class Shown:
+    """What one frame of a wall shows of a target, whatever the method; a coarse `analysis.identify`.
+
+    Args:
+        patterns: Patterns in which handwritten targets differ by more than the frame camera's noise.
+        gain_db: Mean PSNR of the best linear image above that of the mean target, dB.
+    """
+
+    patterns: int
+    gain_db: float
+
+    @classmethod
+    def by(cls, simulation: Simulation) -> Shown | None:
+        """Return what the setup of a simulation shows of its targets; None where it has no linear part."""
+        question = replace(QUICK, target_size_m=simulation.glyphs.target_plane.size_m)
+        try:
+            found = identify(simulation.setup, question)
+        except ConfigError:
+            return None
+        return cls(found.at_camera.patterns, found.at_camera.psnr_db - found.mean_db)
+
+
+@dataclass(frozen=True)
 class SetupFit:
     """A calibrated simulation and its residuals.
 
@@ -82,6 +106,7 @@ class SetupFit:
         known: Masks of the known targets by capture, [S, S] each: pre-training draws them again.
         frame_doubt: By how much the variance of the frames' noise is raised when they are solved for a target.
         ink: Where the known targets have their ink.
+        shown: What one frame shows of a target, whatever the method; None where that is not known.
     """
 
     simulation: Simulation
@@ -98,6 +123,7 @@ class SetupFit:
     known: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     frame_doubt: float = 1.0
     ink: Ink = field(default_factory=Ink)
+    shown: Shown | None = None
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -249,6 +275,7 @@ def fit_setup(
         known,
         1.0 if wall is None else frame_doubt(held, optics.setup, noise),
         Ink.of(shown),
+        Shown.by(simulation),
     )
 
 

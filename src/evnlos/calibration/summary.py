@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ TARGETS = "targets"
 _SOME_OF_COUNTS = 1.1  # times what noise leaves of counts held out: from there on less comes of events
 _MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
 _GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
+_LEAST_GAIN_DB = 1.0  # of the best linear image over the mean target: matte walls have 0.5 to 0.8
+_DOUBTED = 100.0  # times the noise's variance: the light path misses what the frames would tell
 
 EVENT_RESIDUALS = ("counts held out", "surfaces held out")
 """Residuals that the event pixel decides; where they got worse the light path still stands."""
@@ -39,6 +41,8 @@ EVENT_RESIDUALS = ("counts held out", "surfaces held out")
 _UNTOLD = "not told by unknown targets: arbitrary"
 _ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
 _TRY = {"known": "another --preset or start", "unknown": "known targets or another start"}
+
+_SHOWS_MORE = "a smoother wall, a shorter distance or more light shows more"
 
 _TOLD_RATIO = 8.0  # of the highest cutoff that agrees to the lowest: more is no answer
 
@@ -180,10 +184,22 @@ def warnings_of(fit: SetupFit) -> list[str]:
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
     if fit.unexplained is not None:
         found.append(f"{_left(fit.unexplained)}; {cure}")
+    if little := _little_shown(fit):
+        found.append(f"{little}, so expect little or nothing of any method; {_SHOWS_MORE}")
     of_events = _event_warnings(fit)
     if drawn := "sensors and walls" if fit.unexplained is not None else "event pixels" if of_events else "":
         of_events.append(f"{TRAINING_FILE} draws {drawn} from wide ranges around this fit")
     return [*found, *of_events]
+
+
+def _little_shown(fit: SetupFit) -> str:
+    """Return in words that one frame shows hardly more than the mean target; empty where it shows more."""
+    if fit.shown is None or fit.shown.gain_db >= _LEAST_GAIN_DB:
+        return ""
+    return (
+        f"one frame of this wall shows {fit.shown.patterns} patterns of a target above the noise, and its best "
+        f"linear image is {fit.shown.gain_db:.1f} dB above the mean target"
+    )
 
 
 def _to_train_on(fit: SetupFit) -> Simulation:
@@ -234,7 +250,16 @@ def expectation(fit: SetupFit) -> str:
     share, frames = 100 * left.unexplained, "frames"
     if not left.after < 1:
         return f"EPNP: do not use this setup, its {frames} are further from the camera's than their mean"
-    if share < _GOOD:
+    if little := _little_shown(fit):
+        return f"EPNP, like any other method: expect little or nothing here; {little}"
+    if fit.optics.on_bound:
+        what = "not told, as a number of the setup ended on the bound of the search"
+    elif share < _POOR and fit.frame_doubt >= _DOUBTED:
+        what = (
+            f"only fine-tuned networks; its frames are doubted ({fit.frame_doubt:g} times the noise's variance), "
+            "and what saw the simulation alone may be no better than the mean target"
+        )
+    elif share < _GOOD:
         what = "ahead of end-to-end training, by 1 to 7 dB on the setups tried"
     elif share < _FAIR:
         what = "ahead of end-to-end training by about 1 dB"
@@ -277,6 +302,7 @@ def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
         "on_bound": [f"setup.{name}" for name in fit.optics.on_bound],
         "warnings": warnings_of(fit),
         "expectation": expectation(fit),
+        "shown": None if fit.shown is None else asdict(fit.shown),
         "residuals": {
             name: {"before": round(r.before, 5), "after": round(r.after, 5), "noise": round(r.noise, 5)}
             for name, r in fit.residuals.items()

@@ -108,7 +108,7 @@ class CalibrateCommand:
             print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
             print(f"{table(rows)}\n\n{residual_table(fit)}")
         drawn(self.out / "check.png", lambda: draw_calibration(fit, self.out / "check.png"))
-        for line in warnings_of(fit):
+        for line in (warned := warnings_of(fit)):
             say(f"warning: {line}")
         path = write_setup(fit, rows, self.out, self.force)
         if fit.pixel is not None and fit.known:
@@ -120,7 +120,7 @@ class CalibrateCommand:
             )
             print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")
             print(expectation(fit))
-        if fit.worse and not self.force:
+        if (warned or fit.worse) and not self.force:
             raise SystemExit(1)
 
 
