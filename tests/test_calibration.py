@@ -481,7 +481,9 @@ def test_a_fit_at_the_noise_is_not_worse_than_its_start(fit) -> None:
     assert after(0.84).worse == () and after(0.9).worse == ("surfaces held out",)
 
 
-def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targets(fit, tmp_path) -> None:
+def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targets(
+    fit, tmp_path, capsys
+) -> None:
     def leaving(after: float, targets: str):
         left = Residual(before=0.5, after=after, noise=0.1)
         return replace(
@@ -501,6 +503,16 @@ def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targe
     assert "41.2 %" in json.loads((tmp_path / "refused" / "calibration.json").read_text())["warnings"][0]
     assert write_setup(wrong, rows, tmp_path / "forced", force=True).exists()
     assert write_setup(leaving(0.412, "known"), rows, tmp_path / "known").exists()
+    capsys.readouterr()
+    words = ["simulate", "--config", tmp_path / "known" / "training.yaml", "--out", tmp_path / "made"]
+    main([*map(str, words), "--dry-run"])
+    assert "warning: the calibration of this setup warns: frames held out" in capsys.readouterr().err
+    assert (
+        load_setup(tmp_path / "known").misfit.startswith("frames held out") and not fit.simulation.setup.misfit
+    )
+    assert (
+        load_setup(tmp_path / "known").optics() == fit.simulation.setup.optics()
+    )  # the light path is the same
     drawn = load_yaml(Simulation, tmp_path / "known" / "training.yaml").vary["setup.pixel.threshold_on"]
     narrow = fit.training.vary["setup.pixel.threshold_on"]
     assert drawn[1] - drawn[0] > 2 * (narrow[1] - narrow[0])  # no wall fits: sensors and walls are randomized
@@ -529,6 +541,13 @@ def test_events_that_fit_worse_leave_the_wall_and_are_warned_of(fit, tmp_path) -
     frames = replace(wrong, residuals={**wrong.residuals, "frames held out": replace(left, noise=0.1)})
     with pytest.raises(DataError, match=r"frames held out: the residual went from 50\.5 % to 53\.2 %"):
         write_setup(frames, rows_of(frames, EventPixel(), FrameCamera()), tmp_path / "refused")
+
+
+def test_events_of_no_known_kind_are_warned_of(fit) -> None:
+    assert fit.pixel.near
+    far = replace(fit, pixel=replace(fit.pixel, near=False))
+    (line,) = warnings_of(far)
+    assert "the sensor may be of another kind" in line and "not to be trusted" in expectation(far)
 
 
 def test_less_is_expected_of_events_whose_counts_are_left(fit) -> None:

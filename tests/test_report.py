@@ -71,8 +71,10 @@ def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None
     data, runs = made
     setup = named_setup("main-near")
     limits = identify(setup.setup, AnalysisSettings(cells=8, height=12, width=20, writers=1), "main-near")
+    setup = setup._replace(setup=replace(setup.setup, misfit="frames are left"))
     path = write_report(tmp_path / "report.html", data, runs, [], setup=setup, limits=limits)
     page = path.read_text()
+    assert "Warning: the calibration of this setup warns: frames are left." in page
     assert path.stat().st_size < 5e6
     assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))

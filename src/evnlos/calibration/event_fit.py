@@ -73,6 +73,7 @@ class PixelFit:
         dead_time_s: No pixel can be blind for longer: its shortest time between two events, seconds.
         on_edge: Names of what ended on the edge of what was tried.
         compared: Misfit on captures held out, by name of the event model (see `event_models.misfit`).
+        near: Whether its events are of the kind of those held out (see `event_models.is_near`).
     """
 
     pixel: PixelSettings
@@ -81,6 +82,7 @@ class PixelFit:
     dead_time_s: float
     on_edge: tuple[str, ...] = ()
     compared: dict[str, float] = field(default_factory=dict)
+    near: bool = True
 
 
 def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int = 0) -> PixelFit:
@@ -150,7 +152,8 @@ def choose_pixel(
         compared[name] = float(after.sum())
         if is_better(least, after, near):
             best, least = PixelFit(pixel, found.error, cutoff, known.dead_time_s, found.on_edge), after
-    return replace(best, compared=compared)
+    kept = near if best is known else is_near(least, judged, best.pixel, seed)
+    return replace(best, compared=compared, near=kept)
 
 
 def _first_guess(

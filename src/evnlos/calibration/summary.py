@@ -187,6 +187,8 @@ def warnings_of(fit: SetupFit) -> list[str]:
     if little := _little_shown(fit):
         found.append(f"{little}, so expect little or nothing of any method; {_SHOWS_MORE}")
     of_events = _event_warnings(fit)
+    if not of_events and (other := _other_kind(fit)):
+        found.append(other)
     if drawn := "sensors and walls" if fit.unexplained is not None else "event pixels" if of_events else "":
         of_events.append(f"{TRAINING_FILE} draws {drawn} from wide ranges around this fit")
     return [*found, *of_events]
@@ -213,6 +215,16 @@ def _went(fit: SetupFit, name: str) -> str:
     """Return in words what became of a residual."""
     r = fit.residuals[name]
     return f"{name}: the residual went from {100 * r.before:.1f} % to {100 * r.after:.1f} %"
+
+
+def _other_kind(fit: SetupFit) -> str:
+    """Return in words that no event model makes events like the recorded ones; empty where one does."""
+    if fit.pixel is None or fit.pixel.near:
+        return ""
+    return (
+        "captures held out: the best event model misses their events by more than 1.5 times what it misses its "
+        "own by, so the sensor may be of another kind; do not rely on events without fine-tuning"
+    )
 
 
 def _event_warnings(fit: SetupFit) -> list[str]:
@@ -256,7 +268,7 @@ def expectation(fit: SetupFit) -> str:
         what = "not told, as a number of the setup ended on the bound of the search"
     elif share < _POOR and fit.frame_doubt >= _DOUBTED:
         what = (
-            f"only fine-tuned networks; its frames are doubted ({fit.frame_doubt:g} times the noise's variance), "
+            f"only fine-tuned networks; its frames are doubted (variance of the noise x {fit.frame_doubt:g}), "
             "and what saw the simulation alone may be no better than the mean target"
         )
     elif share < _GOOD:
@@ -268,7 +280,7 @@ def expectation(fit: SetupFit) -> str:
     else:
         what = "behind end-to-end training; measure the wall instead (evnlos scan)"
     counts, events = fit.residuals.get("counts held out"), ""
-    if _event_warnings(fit):
+    if _event_warnings(fit) or _other_kind(fit):
         events = "; events: not to be trusted without fine-tuning"
     elif counts is not None and counts.after > _SOME_OF_COUNTS * counts.noise:
         events = (
@@ -368,14 +380,15 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
             f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
         )
     save_pattern(fit.noise.pattern, out / PATTERN_FILE)
-    training = _with_targets(fit, _with_wall(fit, _to_train_on(fit), out), out / TARGETS)
+    training = _with_targets(fit, _with_findings(fit, _to_train_on(fit), out), out / TARGETS)
     save_yaml(training, out / TRAINING_FILE)
-    save_yaml(_with_wall(fit, fit.simulation, out), out / CALIBRATED_FILE)
+    save_yaml(_with_findings(fit, fit.simulation, out), out / CALIBRATED_FILE)
     return out / CALIBRATED_FILE
 
 
-def _with_wall(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
-    """Return the simulation with the file of its fitted wall in the setup's folder; copied there."""
+def _with_findings(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
+    """Return the simulation with the fit's warnings, and a fitted wall's file in the setup's folder."""
+    simulation = simulation.with_setup(misfit="; ".join(warnings_of(fit)))
     setup = simulation.setup
     if not isinstance(setup, FittedSetup):
         return simulation
@@ -383,7 +396,7 @@ def _with_wall(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
     if Path(setup.file).resolve() != path:
         write_atomically(path, Path(setup.file).read_bytes())
     left = round(fit.residuals["frames held out, without pattern"].unexplained, 4)
-    told = {"misfit": "; ".join(warnings_of(fit)), "unexplained": left, "frame_doubt": fit.frame_doubt}
+    told = {"unexplained": left, "frame_doubt": fit.frame_doubt}
     return simulation.with_setup(file=str(path), ink=fit.ink, **told)
 
 

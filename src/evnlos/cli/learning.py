@@ -112,7 +112,7 @@ def fit(
 
     def warn() -> None:
         if not quiet and (misfit := dataset.config.get("setup", {}).get("misfit")):
-            say(f"warning: the simulation's setup does not fit its captures: {misfit}")
+            say(f"warning: the calibration of the simulation's setup warns: {misfit}")
 
     with ProgressBars(quiet) as progress:
         trained = train(dataset, settings, out, weights, told_first(warn, progress), captures)

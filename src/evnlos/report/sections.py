@@ -28,7 +28,8 @@ _LOWEST = 1e-3
 
 def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, target_size_m: float = 0.08) -> str:
     """Return the section that shows the setup; without one, how to have it shown."""
-    head = "<h2>The setup</h2>"
+    warned = () if setup is None else setup.warnings()
+    head = "<h2>The setup</h2>" + "".join(f"<p><b>Warning: {html.escape(line)}.</b></p>" for line in warned)
     if setup is None:
         said = "The setup is not known to this page; <code>evnlos report --setup SETUP.yaml</code> draws it."
         return f"{head}<p class=dim>{said}</p>"

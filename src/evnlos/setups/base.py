@@ -103,6 +103,8 @@ class Setup(Kinded, ABC):
     time_step_s: float | None = None
     """Time step at which the event pixels see the light, seconds, for a model whose events depend on it (v2e);
     None = the event camera chooses its steps from the motion."""
+    misfit: str = ""
+    """What `evnlos calibrate` warned of when it fitted the setup; empty = nothing, or it was not fitted."""
 
     @abstractmethod
     def observe(self, scene: Scene) -> Irradiance:
@@ -232,7 +234,7 @@ class Setup(Kinded, ABC):
 
     def warnings(self) -> list[str]:
         """Return what is known to be wrong with this setup, a line each; whoever uses it repeats them."""
-        return []
+        return [f"the calibration of this setup warns: {self.misfit}"] if self.misfit else []
 
     def wall_description(self) -> str:
         """Return what the wall is, in a few words."""
@@ -327,7 +329,8 @@ class Setup(Kinded, ABC):
     def optics(self: S) -> S:
         """Return wall and geometry alone, with default light and cameras: equal where the light paths are."""
         fresh = type(self)()
-        own = replace(self, **{item: getattr(fresh, item) for item in (*LIGHT_FIELDS, *CAMERA_FIELDS)})
+        other = (*LIGHT_FIELDS, *CAMERA_FIELDS, "misfit")
+        own = replace(self, **{item: getattr(fresh, item) for item in other})
         return replace(own, sensor=self.sensor.resized(fresh.shape))
 
 

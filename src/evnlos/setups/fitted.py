@@ -77,8 +77,6 @@ class FittedSetup(Setup):
     """Side of a target cell, metres."""
     strip_m: tuple[float, float] = (0.24, 0.08)
     """Width and height of the region in which the target moves, metres."""
-    misfit: str = ""
-    """What the calibration could not explain; empty = nothing worth a warning."""
     unexplained: float = 0.0  # pyright: ignore[reportIncompatibleVariableOverride]
     """Share of the light of captures held out that the calibration left beside the noise; 0 = not known."""
     frame_doubt: float = 1.0  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -261,10 +259,6 @@ class FittedSetup(Setup):
         found.append(Parameter("travel_slope", "m/m", self.travel_slope, -0.5, 0.5, 0.005))
         return tuple(found)
 
-    def warnings(self) -> list[str]:
-        """Return what the calibration could not explain."""
-        return [f"the setup does not fit its captures: {self.misfit}"] if self.misfit else []
-
     def wall_description(self) -> str:
         """Return where the wall is from."""
         return f"fitted to captures, {Path(self.file).name or 'no file'}"
@@ -304,7 +298,7 @@ class FittedSetup(Setup):
         return _companion_transport(self._key(), shape), shown
 
     def _key(self) -> FittedSetup:
-        return replace(self.optics(), companion=1.0, misfit="", unexplained=0.0, frame_doubt=1.0, ink=Ink())
+        return replace(self.optics(), companion=1.0, unexplained=0.0, frame_doubt=1.0, ink=Ink())
 
     def _check_travel(self, scene: Scene) -> NDArray[np.float64]:
         """Return centres along the motion [65, 2], metres; refuse those off the strip."""
