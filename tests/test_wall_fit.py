@@ -3,12 +3,14 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from evnlos.calibration import Calibration, fit_setup
 from evnlos.calibration.captures import CaptureSet, grouped, wall_data
+from evnlos.calibration.summary import steps_table
 from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
 from evnlos.calibration.wall_search import fit_wall, travelled
@@ -17,6 +19,7 @@ from evnlos.data.capture_info import CameraInfo, CaptureInfo, MotionInfo, Target
 from evnlos.errors import ConfigError, DataError
 from evnlos.lab import Lobe, Optics, Reflection, cast, fill_throughput
 from evnlos.optics.facets import Pose, SlopeTable
+from evnlos.report.sections import setup_section
 from evnlos.scene import FontGlyphs
 from evnlos.setups import RadiometricSetup
 from evnlos.types import Events, Plane
@@ -110,6 +113,18 @@ def test_the_operator_comes_back(rendered, fitted):
     assert np.linalg.norm(away) < 0.06 * np.linalg.norm(truth.reshape(-1, 32, 96)[..., reached])
     start = fitted.optics.before.matrix(SHAPE, PLANE).numpy()
     assert np.linalg.norm((start - truth).reshape(-1, 32, 96)[..., reached]) > 3 * np.linalg.norm(away)
+
+
+def test_each_step_says_what_it_explains(fitted) -> None:
+    steps = fitted.optics.setup.steps()
+    assert steps and {name for name, (_, kept) in steps.items() if kept} == set(fitted.rest.kept)
+    shares = {name: share for name, (share, _) in steps.items()}
+    assert shares == pytest.approx(fitted.rest.explained, abs=1e-3)
+    assert "Steps of the wall&#x27;s fit" in (page := setup_section("bent", fitted.optics.setup))
+    assert f"light that travels along {100 * shares['light that travels along']:.1f} % (kept)" in page
+    simulation = SimpleNamespace(setup=fitted.optics.setup)
+    lines = steps_table(SimpleNamespace(simulation=simulation)).splitlines()  # type: ignore[arg-type]
+    assert len(lines) == 1 + len(steps) and lines[-1].split()[-1] == "kept"
 
 
 def test_what_moves_along_is_simulated(rendered, fitted):

@@ -42,8 +42,6 @@ _UNTOLD = "not told by unknown targets: arbitrary"
 _ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
 _TRY = {"known": "another --preset or start", "unknown": "known targets or another start"}
 
-_SHOWS_MORE = "a smoother wall, a shorter distance or more light shows more"
-
 _TOLD_RATIO = 8.0  # of the highest cutoff that agrees to the lowest: more is no answer
 
 
@@ -166,6 +164,20 @@ def residual_table(fit: SetupFit) -> str:
     return _aligned(cells)
 
 
+def steps_table(fit: SetupFit) -> str:
+    """Return how much each step of the fit of a wall explains, as a text table; empty for other setups."""
+    if not (steps := _steps(fit)):
+        return ""
+    cells = [["step of the wall's fit, % of what was left beside the noise", "taken away", ""]]
+    cells += [[n, f"{100 * share:.1f}", "kept" if kept else "left out"] for n, (share, kept) in steps.items()]
+    return _aligned(cells)
+
+
+def _steps(fit: SetupFit) -> dict[str, tuple[float, bool]]:
+    setup = fit.simulation.setup
+    return setup.steps() if isinstance(setup, FittedSetup) else {}
+
+
 def _aligned(cells: list[list[str]]) -> str:
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells]
@@ -185,7 +197,7 @@ def warnings_of(fit: SetupFit) -> list[str]:
     if fit.unexplained is not None:
         found.append(f"{_left(fit.unexplained)}; {cure}")
     if little := _little_shown(fit):
-        found.append(f"{little}, so expect little or nothing of any method; {_SHOWS_MORE}")
+        found.append(f"{little}, so expect little or nothing of any method")
     of_events = _event_warnings(fit)
     if not of_events and (other := _other_kind(fit)):
         found.append(other)
@@ -221,10 +233,7 @@ def _other_kind(fit: SetupFit) -> str:
     """Return in words that no event model makes events like the recorded ones; empty where one does."""
     if fit.pixel is None or fit.pixel.near:
         return ""
-    return (
-        "captures held out: the best event model misses their events by more than 1.5 times what it misses its "
-        "own by, so the sensor may be of another kind; do not rely on events without fine-tuning"
-    )
+    return "captures held out: no event model makes such events, the sensor may be of another kind; fine-tune"
 
 
 def _event_warnings(fit: SetupFit) -> list[str]:
@@ -267,10 +276,7 @@ def expectation(fit: SetupFit) -> str:
     if fit.optics.on_bound:
         what = "not told, as a number of the setup ended on the bound of the search"
     elif share < _POOR and fit.frame_doubt >= _DOUBTED:
-        what = (
-            f"only fine-tuned networks; its frames are doubted (variance of the noise x {fit.frame_doubt:g}), "
-            "and what saw the simulation alone may be no better than the mean target"
-        )
+        what = f"only fine-tuned networks, as frames are doubted (variance of the noise x {fit.frame_doubt:g})"
     elif share < _GOOD:
         what = "ahead of end-to-end training, by 1 to 7 dB on the setups tried"
     elif share < _FAIR:
@@ -315,6 +321,7 @@ def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
         "warnings": warnings_of(fit),
         "expectation": expectation(fit),
         "shown": None if fit.shown is None else asdict(fit.shown),
+        "steps": {name: {"explained": share, "kept": kept} for name, (share, kept) in _steps(fit).items()},
         "residuals": {
             name: {"before": round(r.before, 5), "after": round(r.after, 5), "noise": round(r.noise, 5)}
             for name, r in fit.residuals.items()

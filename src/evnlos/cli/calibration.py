@@ -90,7 +90,7 @@ class CalibrateCommand:
             write_event_errors,
             write_setup,
         )
-        from evnlos.calibration.summary import check_out, expectation
+        from evnlos.calibration.summary import check_out, expectation, steps_table
         from evnlos.data import captures_in
         from evnlos.plot.results import draw_calibration
         from evnlos.setups import TRAINING_FILE
@@ -106,7 +106,7 @@ class CalibrateCommand:
             print(json.dumps(calibration_values(fit, rows)))
         else:
             print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
-            print(f"{table(rows)}\n\n{residual_table(fit)}")
+            print("\n\n".join(filter(None, (table(rows), residual_table(fit), steps_table(fit)))))
         drawn(self.out / "check.png", lambda: draw_calibration(fit, self.out / "check.png"))
         for line in (warned := warnings_of(fit)):
             say(f"warning: {line}")

@@ -259,6 +259,15 @@ class FittedSetup(Setup):
         found.append(Parameter("travel_slope", "m/m", self.travel_slope, -0.5, 0.5, 0.005))
         return tuple(found)
 
+    def steps(self) -> dict[str, tuple[float, bool]]:
+        """Return what each step of the fit after pose and slopes took away, and whether it is kept, by name.
+
+        A share of what was left of captures held out, beside their noise; negative where a step did harm.
+        """
+        notes = self.fitted().about.notes
+        kept = notes.get("kept", ())
+        return {name: (float(share), name in kept) for name, share in notes.get("explained", {}).items()}
+
     def wall_description(self) -> str:
         """Return where the wall is from."""
         return f"fitted to captures, {Path(self.file).name or 'no file'}"
