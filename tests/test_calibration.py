@@ -32,7 +32,7 @@ from evnlos.calibration import (
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import _block_counts, count_map, read_recordings, within
 from evnlos.calibration.frame_model import FrameModel, fit_frame_noise, frame_doubt, working_shape
-from evnlos.calibration.transport_fit import levenberg_marquardt, values_of
+from evnlos.calibration.transport_fit import clustered_error, levenberg_marquardt, values_of
 from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
@@ -353,6 +353,32 @@ def test_standard_error_is_that_of_linear_theory() -> None:
     assert math.isinf(blind.error[1]) and math.isfinite(blind.error[0])
 
 
+def test_errors_hold_what_a_model_gets_wrong_of_captures_and_of_the_image() -> None:
+    """A level is fitted to frames whose captures differ by more than noise, and not by independent samples."""
+    draw, captures = np.random.default_rng(0), np.repeat(np.arange(8), 5)
+    slopes = torch.ones(40 * 60, 1, dtype=torch.float64)
+    found, alone = [], []
+    for _ in range(200):
+        wrong = draw.normal(0, 0.5, 8)[captures][:, None, None]
+        seen = torch.from_numpy(draw.normal(0, 1, (40, 6, 10)) + wrong)
+        left = seen - seen.mean()
+        error = clustered_error(slopes, left, captures)[0]
+        found.append(abs(float(seen.mean())) < 2 * error)
+        alone.append(abs(float(seen.mean())) < 2 * float(left.std()) / math.sqrt(left.numel()))
+    assert np.mean(found) > 0.88 and np.mean(alone) < 0.5
+
+
+def test_errors_grow_with_what_is_left_and_are_unknown_on_a_bound(fit) -> None:
+    doubled = fit.optics.raised(Residual(0.9, 0.2, 0.1))
+    np.testing.assert_allclose(doubled.error, 2 * fit.optics.error)
+    parameters = tuple(
+        replace(p, low=values_of(fit.optics.setup)[p.name]) if p.name == "roughness" else p
+        for p in fit.optics.parameters
+    )
+    stuck = replace(fit.optics, parameters=parameters).raised(Residual(0.9, 0.1, 0.1))
+    assert np.isinf(stuck.error).all()
+
+
 def test_no_step_of_the_search_is_longer_than_it_may_be() -> None:
     tried = []
 
@@ -588,6 +614,8 @@ def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:
     shown = capsys.readouterr()
     assert stop.value.code == 1 and (tmp_path / "setup" / "setup.yaml").exists()  # warned of, and nothing lost
     assert "on the bound of the search" in shown.out and "ahead of end-to-end" not in shown.out
+    stated = json.loads((tmp_path / "setup" / "calibration.json").read_text())["parameters"]
+    assert stated["setup.camera_distance_m"]["error"] is None  # it follows from where the bound is
     assert any(line.startswith("warning: setup.") and "evnlos scan" in line for line in shown.err.splitlines())
 
 

@@ -147,9 +147,9 @@ class CaptureSet:
         """Return the frames of all captures, one after the other, digital numbers [N, H, W]."""
         return np.concatenate([capture.frames for capture in self.captures])
 
-    def frame_of(self) -> NDArray[np.int64]:
-        """Return the number of the capture that each frame of `frames` belongs to, int64 [N]."""
-        return np.repeat(np.arange(len(self.captures)), [len(capture.frames) for capture in self.captures])
+    def frame_of(self, every: int = 1) -> NDArray[np.int64]:
+        """Return the number of the capture that every n-th frame of each belongs to, int64 [N]."""
+        return np.repeat(np.arange(len(self.captures)), [len(c.frames[::every]) for c in self.captures])
 
 
 def read_capture_set(

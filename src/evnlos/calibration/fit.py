@@ -233,6 +233,8 @@ def fit_setup(
     residuals[_WITHOUT_PATTERN] = replace(
         residuals["frames held out"], before=residuals["frames held out"].after, after=corrected
     )
+    if wall is None:
+        optics = optics.raised(residuals[_WITHOUT_PATTERN])
     start_pixel: PixelSettings = settings.start.pixel
     if settings.events:
         start_pixel = continuous(start_pixel)

@@ -126,7 +126,6 @@ def levenberg_marquardt(
             damping *= 6
         if not better or before - float(now.square().mean().sqrt()) < tolerance * before:
             break
-    # The last Jacobian is that of the step before: good enough for an error bar.
     return Minimum(values, _standard_error(jacobian, now), float(now.square().mean().sqrt()), count)
 
 
@@ -175,6 +174,35 @@ def _standard_error(jacobian: torch.Tensor, now: torch.Tensor) -> NDArray[np.flo
     return np.sqrt(variance * spread) / scale
 
 
+def clustered_error(
+    jacobian: torch.Tensor, left: torch.Tensor, captures: NDArray[np.int64], blocks: int = 5
+) -> NDArray[np.float64]:
+    """Return standard errors [P] that hold a model's misfit, none below that of independent samples.
+
+    What a model gets wrong is alike over a capture and a part of the image, so its pixels are no independent
+    samples (the sandwich estimator with two kinds of clusters; Cameron, Gelbach, Miller 2011).
+
+    Args:
+        jacobian: Derivatives of the residual [N h w, P].
+        left: The residual at the minimum [N, h, w].
+        captures: Number of the capture of each frame [N].
+        blocks: Blocks of the image along either axis.
+    """
+    count, (height, width) = len(np.unique(captures)), left.shape[1:]
+    row, column = (torch.arange(n) * blocks // n for n in (height, width))
+    block = (row[:, None] * blocks + column).flatten()
+    scores = (jacobian * left.flatten()[:, None]).double().unflatten(0, (len(left), height * width))
+    parts = []
+    for index, values in ((torch.from_numpy(captures), scores.sum(dim=1)), (block, scores.sum(dim=0))):
+        each = values.new_zeros(int(index.max()) + 1, values.shape[1]).index_add(0, index, values)
+        parts.append(each.T @ each)
+    few = count / max(count - 1, 1)
+    scatter = (parts[0] * few + parts[1]).numpy()
+    alone = _standard_error(jacobian, left.flatten())
+    inverse = np.linalg.pinv((jacobian.T @ jacobian).double().numpy(), hermitian=True)
+    return np.maximum(alone, np.sqrt(np.diag(inverse @ scatter @ inverse)))
+
+
 _FINE_STEPS = 3  # the coarse stage has done the way; every step of the fine one costs seconds
 _EXPLAINED = 0.05
 _REACH = 5.0
@@ -188,14 +216,19 @@ class TransportFit:
         before: The start, with the gain and ambient light that suit it best.
         setup: The fit, gain and ambient light included.
         parameters: The parameters that were searched for, with their values at the start.
-        error: Standard error of each, in its own unit, from the residual of the last stage; the model's own
-            errors are not in it.
+        error: Standard error of each, in its own unit, from the residual of the last stage; see `raised`.
     """
 
     before: Setup
     setup: Setup
     parameters: tuple[Parameter, ...]
     error: NDArray[np.float64]
+
+    def raised(self, left: Residual) -> TransportFit:
+        """Return the fit with errors times a residual over its noise; infinite where one is on a bound."""
+        return replace(
+            self, error=self.error * (math.inf if self.on_bound else max(1, left.after / left.noise))
+        )
 
     @property
     def on_bound(self) -> dict[str, float]:
@@ -270,7 +303,8 @@ def fit_transport(
     coarse = FrameModel(capture_set, working_shape(capture_set.shape, columns // 2), _every(capture_set, 400))
     fine = FrameModel(capture_set, working_shape(capture_set.shape, columns), _every(capture_set, 200))
     quick, _ = _search(coarse, _scanned(coarse, start.coarsened(2.0)), parameters, iterations)
-    found, error = _search(fine, quick.coarsened(), parameters, min(iterations, _FINE_STEPS))
+    of = capture_set.frame_of(_every(capture_set, 200))
+    found, error = _search(fine, quick.coarsened(), parameters, min(iterations, _FINE_STEPS), of)
     found = found.coarsened()
     full = FrameModel(capture_set, capture_set.shape, _every(capture_set, 200))
     before = start.coarsened()
@@ -280,7 +314,11 @@ def fit_transport(
 
 
 def _search(
-    model: FrameModel, start: Setup, parameters: tuple[Parameter, ...], iterations: int
+    model: FrameModel,
+    start: Setup,
+    parameters: tuple[Parameter, ...],
+    iterations: int,
+    captures: NDArray[np.int64] | None = None,
 ) -> tuple[Setup, NDArray[np.float64]]:
     def residual(values: NDArray[np.float64]) -> torch.Tensor:
         try:
@@ -297,9 +335,14 @@ def _search(
         [(encoded(p, p.low), encoded(p, p.high)) for p in parameters],
         iterations=iterations,
     )
-    result = moved(start, parameters, found.values)
+    result, error = moved(start, parameters, found.values), found.error
+    if captures is not None:
+        left, steps = residual(found.values), np.array([p.step for p in parameters])
+        high = np.array([encoded(p, p.high) for p in parameters])
+        slopes = forward_jacobian(residual, found.values, left.flatten(), steps, high, "errors, ")
+        error = clustered_error(slopes, left, captures)
     scale = [values_of(result)[p.name] if p.log else 1.0 for p in parameters]
-    return result, found.error * np.array(scale)
+    return result, error * np.array(scale)
 
 
 def _scanned(model: FrameModel, start: Setup) -> Setup:
