@@ -33,7 +33,7 @@ from evnlos.cli import main
 from evnlos.cli.main import command_of
 from evnlos.config import load_yaml, save_yaml
 from evnlos.errors import ConfigError, DataError
-from evnlos.events import write_events
+from evnlos.events import read_events, write_events
 from evnlos.types import Events
 
 QUICK = PixelFitSettings(("continuous",), pixels=80, ensemble=16, simulations=36, checks=12)
@@ -132,6 +132,20 @@ def test_the_command_writes_a_pixel_that_other_commands_take(folder, tmp_path, c
     assert stop.value.code == 2 and "--force" in capsys.readouterr().err
 
 
+def test_a_pixel_that_describes_no_sensor_is_not_recommended(shared_data, tmp_path, capsys) -> None:
+    """The light of this recording moves; nothing is constant about it."""
+    path = shared_data / "recordings" / "faery_dvs.es"
+    if not path.is_file():
+        pytest.skip(f"no {path.name}")
+    words = ["--models", "continuous", "--pixels", "80", "--ensemble", "12", "--simulations", "30"]
+    with pytest.raises(SystemExit) as stop:
+        main(["pixel", "fit", str(path), "--light", "static", "60", "--out", str(tmp_path / "fit"), *words])
+    shown = capsys.readouterr()
+    assert stop.value.code == 1 and "does not describe this sensor" in shown.err
+    assert "events of it:" not in shown.out and (tmp_path / "fit" / "pixel.yaml").exists()
+    assert not json.loads((tmp_path / "fit" / "pixel_fit.json").read_text())["describes_the_sensor"]
+
+
 def test_the_settings_of_other_commands_take_the_pixel(tmp_path) -> None:
     from evnlos.calibration import Calibration
     from evnlos.data import Simulation
@@ -167,6 +181,28 @@ def test_time_stamps_on_a_grid_are_no_refractory_period() -> None:
     events = Events(times, place[0], place[1], draw.random(20_000) < 0.5, 8, 8)
     assert tick_of(events) == 1000
     assert refractory_of([events]).state != "identified"
+
+
+def test_a_sensor_s_scan_is_no_refractory_period(shared_data) -> None:
+    """Intervals on a comb tell how often a sensor is read; the free ones above a pile, that it was blind."""
+    draw, pixels = np.random.default_rng(0), 60
+
+    def events_of(intervals: np.ndarray) -> Events:
+        times = np.cumsum(np.round(intervals).astype(np.int64), axis=1).ravel()
+        order = np.argsort(times, kind="stable")
+        x = np.repeat(np.arange(pixels), intervals.shape[1])[order]
+        return Events(times[order], x, 0 * x, np.ones(len(x), bool), pixels, 1)
+
+    free = 200 + np.where(draw.random((pixels, 80)) < 0.4, 0, draw.exponential(500, (pixels, 80)))
+    assert refractory_of([events_of(free)]).state == "identified"
+    scanned = 195.0 * draw.geometric(0.3, (pixels, 80)) + draw.integers(-1, 2, (pixels, 80))
+    assert refractory_of([events_of(scanned)]).state == "at most"
+    recordings = sorted((shared_data / "recordings").glob("*"))
+    if not recordings:
+        pytest.skip("no recordings")
+    for path in recordings:
+        if path.suffix not in (".npz", ".json"):  # those say what is in the others
+            assert refractory_of([read_events(path)]).state != "identified", path.name
 
 
 def test_light_that_moves_is_not_called_constant() -> None:

@@ -28,6 +28,11 @@ _UNLIKELY = 0.01
 _FEWEST_PAIRS = 30  # intervals that are all alike before they count as the refractory period
 _FINE_TICKS = 5  # ticks of the time stamps that a refractory period must last to be told from them
 _PILE = 5.0  # times as many intervals at the shortest as just above it
+_TEETH, _PARTS = (
+    6,
+    8,
+)  # how far a comb is followed, and in how many parts of the shortest interval
+_ON_COMB = 0.7  # resultant of the phases: 1 on a comb, 0.6 where intervals fall off in a fifth of it
 _STATIC_S, _STATIC_PX = 10.0, 200
 _BINS = 24
 
@@ -111,7 +116,8 @@ def refractory_of(events: Sequence[Events]) -> Estimate:
     """Return the refractory period, from how the shortest intervals pile up.
 
     A pixel whose light has moved by more than a threshold while it was blind sends its next event at the end of
-    the refractory period, so many intervals are alike. Where they do not pile up, only a bound is known.
+    the refractory period, so many intervals are alike. Where they do not pile up, only a bound is known. So it is
+    where they pile up again at multiples of it, or of a part of it: so often is that sensor read.
 
     Args:
         events: Recordings of one sensor.
@@ -123,12 +129,26 @@ def refractory_of(events: Sequence[Events]) -> Estimate:
     base = shortest * 1e6
     pile = every[(every >= 0.98 * base - 1) & (every <= 1.05 * base + 1)]
     above = np.count_nonzero((every > 1.05 * base + 1) & (every <= 1.12 * base + 3))
-    if len(pile) < _FEWEST_PAIRS or len(pile) < _PILE * max(above, 1) or base < _FINE_TICKS * tick_us:
+    if (
+        len(pile) < _FEWEST_PAIRS
+        or len(pile) < _PILE * max(above, 1)
+        or base < _FINE_TICKS * tick_us
+        or _is_scanned(every, base)
+    ):
         return Estimate("refractory_s", 0.0, 0.0, shortest, "at most")
     low, middle, high = np.quantile(pile, (0.025, 0.5, 0.975))
     return Estimate(
         "refractory_s", float(middle) * 1e-6, float(low - 1) * 1e-6, float(high + 1) * 1e-6, "identified"
     )
+
+
+def _is_scanned(every: Array, base: float) -> bool:
+    """Return whether intervals longer than the shortest lie on a comb of it, or of a part of it."""
+    longer = every[(every > 1.12 * base + 3) & (every < _TEETH * base)]
+    if len(longer) < _FEWEST_PAIRS:
+        return False
+    spacings = np.outer(base / np.arange(1, _PARTS + 1), np.linspace(0.97, 1.03, 61)).ravel()
+    return any(abs(np.exp(2j * np.pi / one * longer).mean()) > _ON_COMB for one in spacings if one > 2)
 
 
 def compared(

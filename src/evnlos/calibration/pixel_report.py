@@ -104,6 +104,11 @@ class KnownLightFit:
     seconds: dict[str, float]
     warnings: tuple[str, ...]
 
+    @property
+    def describes(self) -> bool:
+        """Whether the pixel describes the sensor: its misfit is at most twice what chance allows."""
+        return self.best is not None and self.best.misfit <= _BAD_FIT
+
 
 def fit_known_light(
     manifest: Manifest, settings: PixelFitSettings | None = None, progress: Progress = silent
@@ -213,6 +218,7 @@ def values_of_fit(fit: KnownLightFit) -> dict[str, Any]:
         "model": None if best is None else best.name,
         "estimates": [_plain(one) for one in _estimates(fit)],
         "models": [asdict(one) for one in fit.compared],
+        "describes_the_sensor": fit.describes,
         "misfit": {one.name: one.misfit for one in fit.fits},
         "all_estimates": {one.name: [_plain(each) for each in one.estimates] for one in fit.fits},
         "correlation": None

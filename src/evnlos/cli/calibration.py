@@ -367,10 +367,12 @@ class PixelCommand:
             drawn(self.out / PIXEL_FIGURE, lambda: draw_pixel_fit(fit, self.out / PIXEL_FIGURE))
         for line in fit.warnings:
             say(f"warning: {line}")
+        print(json.dumps(values_of_fit(fit)) if self.json else "\n".join(lines_of_fit(fit)))
+        if written is not None and not fit.describes:
+            say(f"warning: {written} does not describe this sensor: do not simulate events with it")
+            raise SystemExit(1)
         if self.json:
-            print(json.dumps(values_of_fit(fit)))
             return
-        print("\n".join(lines_of_fit(fit)))
         if written is None:
             say(f"note: no {PIXEL_FILE}: nothing decides the pixel")
         else:
