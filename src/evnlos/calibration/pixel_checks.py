@@ -116,8 +116,8 @@ def refractory_of(events: Sequence[Events]) -> Estimate:
     """Return the refractory period, from how the shortest intervals pile up.
 
     A pixel whose light has moved by more than a threshold while it was blind sends its next event at the end of
-    the refractory period, so many intervals are alike. Where they do not pile up, only a bound is known. So it is
-    where they pile up again at multiples of it, or of a part of it: so often is that sensor read.
+    the refractory period, so many intervals are alike. Where they do not, only a bound is known. So it is where
+    they pile up again at multiples of it, or of a part of it: so often is that sensor read.
 
     Args:
         events: Recordings of one sensor.

@@ -55,6 +55,8 @@ _MAY_BE_NONE = (MISMATCH, "leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_d
 _STUCK = 0.6  # misfit at which an attempt may have ended beside the likeliest place
 _ATTEMPTS = 3
 _REPLICATES = 4
+_WIDER = 1.6  # errors of v2e's pixel over those of the posterior, of these (benchmarks/pixel_fit_coverage.py)
+_WIDENED = ("threshold_on", "threshold_off", "leak_rate_hz", "shot_noise_rate_hz")
 
 _THRESHOLDS = (
     Free("threshold_on", 0.03, 1.5, 0.05),
@@ -281,7 +283,8 @@ def fit_candidate(
         found.append(search.attempt(len(found)))
     draws, _ = min(found, key=lambda one: one[1])
     misfit = search.misfit(draws.mean(axis=0))
-    estimates = tuple(_estimate(one, draws[:, k]) for k, one in enumerate(free))
+    wide = [_WIDER if isinstance(start, EventPixel) and one.name in _WIDENED else 1.0 for one in free]
+    estimates = tuple(_estimate(one, draws[:, k], wide[k]) for k, one in enumerate(free))
     pixel = pixel_at(start, free, np.median(draws, axis=0))
     for one in estimates:
         if one.state == "at most" and one.name in _MAY_BE_NONE[1:]:
@@ -384,8 +387,9 @@ def _covariance(panels: Panels, pixel: PixelSettings, seed: int) -> tuple[Array,
     return half + least, expected
 
 
-def _estimate(free: Free, draws: Array) -> Estimate:
+def _estimate(free: Free, draws: Array, wider: float = 1.0) -> Estimate:
     low, middle, high = np.quantile(draws, (0.025, 0.5, 0.975))
+    low, high = middle - wider * (middle - low), middle + wider * (high - middle)
     shares = [NormalDist().cdf(float(u)) for u in (low, high)]
     state = "identified"
     if shares[1] - shares[0] > 0.5:
