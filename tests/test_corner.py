@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from PIL import Image
 import torch
 
 from evnlos.cameras import FrameCamera
@@ -371,6 +372,25 @@ def test_a_video_is_written_and_read_back_bit_for_bit(tmp_path) -> None:
     video = open_video(tmp_path / "a.gif")
     part = next(light for _, light in video.part((3, 2, 11, 20)))
     assert (part == frames[0][2:20, 3:11]).all()
+
+
+@pytest.mark.parametrize("fps", [1.0, 12.0, 15.0, 30.0, 45.0, 50.0])
+def test_a_gif_keeps_the_times_of_its_frames(tmp_path, fps) -> None:
+    from evnlos.cameras.video import open_video
+
+    draw = np.random.default_rng(11)
+    frames = [draw.integers(0, 256, (6, 8), np.uint8) for _ in range(90)]
+    write_video(tmp_path / "a.gif", iter(frames), fps)
+    times_s = [t for t, _ in open_video(tmp_path / "a.gif")]
+    assert np.allclose(times_s, np.arange(90) / fps, atol=0.0051)
+    with Image.open(tmp_path / "a.gif") as image:
+        shown_ms = [image.info["duration"] for n in range(90) if image.seek(n) is None]
+    assert abs(sum(shown_ms) - 90_000 / fps) <= 5 and min(shown_ms) >= 20
+
+
+def test_a_gif_of_more_images_than_viewers_show_is_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match=r"60 frames per second; a GIF has 50 at most: write \.mp4"):
+        write_video(tmp_path / "a.gif", [np.zeros((6, 8), np.uint8)], 60.0)
 
 
 def test_two_commands_show_somebody(tmp_path, capsys, monkeypatch) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, count, pairwise
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -29,6 +29,7 @@ Tone = Literal["as-is", "srgb", "rec709"]
 """What the numbers of an image mean: light as they are, or codes of a tone curve to undo."""
 
 _OF_EVENTS = (".raw", ".h5", ".npz", ".aedat", ".aedat4", ".bag", ".db3", ".mcap", ".bin", ".csv", ".dat")
+_GIF_FPS = 50  # viewers slow down images of less than two hundredths of a second
 _LUMINANCE_709 = 0.2126, 0.7152, 0.0722
 
 
@@ -118,13 +119,13 @@ def write_video(
     Args:
         path: The file, or the folder to make.
         frames: Grey, uint8 [H, W], all of one size.
-        fps: Frames per second; a folder does not keep it, and a GIF keeps whole hundredths of a second.
+        fps: Frames per second; a folder does not keep it, a GIF (50 at most) rounds times to hundredths.
         quality: H.264's CRF, 1 (best) to 51, as cameras and phones compress; None = without loss. With it an
             odd last row or column is left out.
         effort: How long the encoder looks for a smaller file where there is loss.
 
     Raises:
-        ConfigError: Another ending, or a quality out of its range.
+        ConfigError: Another ending, a quality out of its range, or a GIF of more than 50 frames per second.
         DataError: No frames.
         MissingDependencyError: A file of FFmpeg's without PyAV.
     """
@@ -133,6 +134,8 @@ def write_video(
         raise ConfigError(f"{path}: videos are written as .mp4, .mkv, .gif or a folder of PNG; end its name so")
     if quality is not None and (not 1 <= quality <= 51 or suffix not in (".mp4", ".mkv")):
         raise ConfigError(f"the quality is {quality}; give 1 to 51 for .mp4 or .mkv, none for other videos")
+    if suffix == ".gif" and fps > _GIF_FPS:
+        raise ConfigError(f"{path}: {fps:g} frames per second; a GIF has {_GIF_FPS} at most: write .mp4")
     shots = iter(frames)
     first = next(shots, None)
     if first is None:
@@ -144,12 +147,9 @@ def write_video(
         return
     with new_file(path) as draft:
         if suffix == ".gif":
-            rest = (Image.fromarray(frame) for frame in shots)
+            images = _shown(chain([first], shots), fps)
             with draft.open("wb") as file:
-                shown = max(10 * round(100 / fps), 20)
-                Image.fromarray(first).save(
-                    file, "GIF", save_all=True, append_images=rest, duration=shown, loop=0
-                )
+                next(images).save(file, "GIF", save_all=True, append_images=images, loop=0)
             return
         av = _pyav()
         with av.open(str(draft), "w", format="mp4" if suffix == ".mp4" else "matroska") as container:
@@ -172,6 +172,15 @@ def write_video(
                     picture = av.VideoFrame.from_ndarray(frame, format="gray")
                 container.mux(stream.encode(picture))
             container.mux(stream.encode())
+
+
+def _shown(frames: Iterable[NDArray[np.uint8]], fps: float) -> Iterator[Image.Image]:
+    """Yield images of a GIF: each lasts to the hundredth of a second nearest to where the next one begins."""
+    begins = (round(100 * number / fps) for number in count())
+    for frame, (start, end) in zip(frames, pairwise(begins), strict=False):
+        image = Image.fromarray(frame)
+        image.info["duration"] = 10 * (end - start)
+        yield image
 
 
 class PictureSource(Protocol):
