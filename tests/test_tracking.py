@@ -12,6 +12,8 @@ import torch
 import yaml
 from scipy.ndimage import gaussian_filter
 
+from evnlos.analysis import target_psnr
+from evnlos.analysis.bounds import canvas_decibel
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.cli.invert_captures import linear_setup
@@ -650,6 +652,28 @@ def test_the_command_inverts_a_sequence(capture, tmp_path, capsys) -> None:
         ]
     )
     assert "unexplained" not in capsys.readouterr().out
+
+
+def test_scores_do_not_depend_on_the_unit_of_length(capture, tmp_path) -> None:
+    folder, _ = capture
+    found = []
+    for scale, size_m in ((0.1, 0.006), (1.0, 0.06), (10.0, 0.6), (10.0, 0.8), (1.0, 0.08)):
+        shutil.copytree(folder, tmp_path / f"{size_m}")
+        page = yaml.safe_load((tmp_path / f"{size_m}" / "capture.yaml").read_text())
+        page["target"]["size_m"] = size_m
+        page["motion"] |= {"start_m": [-0.04 * scale, 0.0], "speed_m_s": 0.02 * scale}
+        (tmp_path / f"{size_m}" / "capture.yaml").write_text(yaml.safe_dump(page))
+        one = read_capture(tmp_path / f"{size_m}")
+        motion = one.motion.position_m(one.frame_times_us[1:] * 1e-6)
+        image = torch.from_numpy(0.7 * one.target.rasterise(Plane(16, 16, size_m / 16)))
+        found.append(target_psnr(one, image, size_m, motion))
+    assert np.allclose(found[:2], found[2], atol=0.002) and abs(found[3] - found[4]) < 0.002
+    assert 10 < found[2] < 40
+    away = motion + [9.0, 0.0]
+    hidden = replace(one, target=replace(one.target, mask=np.zeros((4, 4))))
+    assert target_psnr(hidden, image, size_m, away) is None  # nothing there, nothing drawn
+    sizes = canvas_decibel(0.01, Plane(32, 32, 0.0025)), canvas_decibel(0.01, Plane(32, 32, 0.025))
+    assert sizes[0] == pytest.approx(sizes[1])
 
 
 def test_the_command_says_where_a_setup_is_not_that_of_the_capture(capture, tmp_path, capsys) -> None:

@@ -28,4 +28,5 @@ from .scores import available_lpips as available_lpips
 from .scores import confusion as confusion
 from .scores import load_lpips as load_lpips
 from .scores import score as score
+from .scores import scored_sampling as scored_sampling
 from .scores import target_psnr as target_psnr

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from evnlos.analysis.scores import scored_sampling
 from evnlos.cameras import EVENT_MODELS, CrossingLaw, PixelSettings
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data import Capture, Sampling
@@ -61,7 +62,9 @@ class SequenceAnalysisSettings:
     writers: int = 6
     """Writers whose characters are the prior."""
     cells: int = 32
-    """Cells a side of the target plane of 80 mm."""
+    """Cells a side of the target plane."""
+    target_size_m: float = 0.08
+    """Side of the target plane, metres."""
     crossing_noise: float = 0.04
     """Standard deviation of the error of a crossing beside the event model's own, log units."""
     other_noises: tuple[float, ...] = (0.08, 0.02, 0.01)
@@ -74,9 +77,8 @@ class SequenceAnalysisSettings:
     """Whether the frame camera's fixed pattern is known; where not, it is integrated out."""
 
     def __post_init__(self) -> None:
-        for name in ("travel_m", "speed_m_s", "crossing_noise"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
+        for name in ("travel_m", "speed_m_s", "crossing_noise", "target_size_m"):
+            if not 0 < (value := getattr(self, name)) < math.inf:
                 raise ConfigError(f"SequenceAnalysisSettings.{name} is {value}; give a positive number")
         wrong = [count for count in self.counts if not 1 <= count <= self.positions]
         if wrong or not self.counts:
@@ -132,7 +134,7 @@ class EventBound:
 
 @dataclass(frozen=True)
 class Bounds:
-    """What frames and events of a moving target are worth, on the standard canvas.
+    """What frames and events of a moving target are worth, on the canvas of such a target.
 
     Args:
         name: Name of the setup.
@@ -196,9 +198,8 @@ def sequence_bounds(
         ConfigError: The setup is not linear.
     """
     settings = settings or SequenceAnalysisSettings()
-    target_plane = Plane(settings.cells, settings.cells, 0.08 / settings.cells)
-    count = min(settings.coefficients, settings.cells**2)
-    prior = handwritten_prior(target_plane, count, settings.writers)
+    target_plane = Plane(settings.cells, settings.cells, settings.target_size_m / settings.cells)
+    prior = handwritten_prior(target_plane, min(settings.coefficients, settings.cells**2), settings.writers)
     grid = (min(setup.shape[0], _GRID[0]), min(setup.shape[1], _GRID[1]))
     span = (0.0, settings.duration_s)
     light = sequence_light(setup, prior, settings.motion.position_m, span, grid)
@@ -212,8 +213,7 @@ def sequence_bounds(
     found = []
     typical = float(light(references[0]).mean()) * WHITE_DN
     for kind, pixel in _models(setup.pixel, others=settings.other_models).items():
-        law = pixel.crossing_law(typical)
-        if law is None:
+        if (law := pixel.crossing_law(typical)) is None:
             continue
         note(f"events of {kind}")
         noises = (settings.crossing_noise, *(settings.other_noises if pixel is setup.pixel else ()))
@@ -366,16 +366,17 @@ def _silence_information(
     return row_information(light, levels, ends, weight[None], 0.0)[0]
 
 
-def canvas_decibel(error: float, target_plane: Plane) -> float:
-    """Return the PSNR on the standard canvas of a mean squared error of the target's cells; dark elsewhere.
+def canvas_decibel(error: float, target_plane: Plane, sampling: Sampling | None = None) -> float:
+    """Return the PSNR of a mean squared error of the target's cells; dark elsewhere.
 
     Args:
         error: Mean squared error of a cell.
         target_plane: The cells.
+        sampling: What is scored; None: `scored_sampling`.
     """
-    sampling = Sampling()
+    sampling = sampling or scored_sampling(target_plane.extent_m[1])
     canvas = sampling.width * sampling.scored_rows * sampling.pitch_m**2
-    return -10 * math.log10(error * target_plane.height * target_plane.width * target_plane.pitch_m**2 / canvas)
+    return -10 * math.log10(error * math.prod(target_plane.extent_m) / canvas)
 
 
 def _decibel(prior: PatternPrior, information: list[np.ndarray]) -> tuple[float, ...]:

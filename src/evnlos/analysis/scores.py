@@ -15,7 +15,7 @@ import json
 import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -32,6 +32,7 @@ from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
 from evnlos.models.drawn import TargetGrid
 from evnlos.scene import Target
 from evnlos.tensor_file import read_sealed
+from evnlos.types import target_side_m
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 _MOST_NAMED = 8  # of what is taken for something else
@@ -338,10 +339,26 @@ def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: 
     return found
 
 
+def scored_sampling(size_m: float, position_m: NDArray[np.float64] | None = None) -> Sampling:
+    """Return the standard sample as large, against a target, as it is for the usual one of 8 cm.
+
+    Args:
+        size_m: Side of the target, metres.
+        position_m: Its centre (x, y), [N, 2], metres: on a longer way the canvas is larger; None: about 0.
+    """
+    usual = Sampling()
+    scale = size_m / target_side_m(usual.canvas)
+    if position_m is not None:
+        sides = usual.canvas.extent_m[1], usual.scored_rows * usual.pitch_m
+        needed = float(((2 * np.abs(position_m).max(axis=0) + size_m) / sides).max())
+        scale = needed if needed > 1.04 * scale else scale
+    return replace(usual, pitch_m=usual.pitch_m * scale)
+
+
 def target_psnr(
     capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]
 ) -> float | None:
-    """Return the PSNR of an image [cells, cells] on the standard sample, dB; None where the truth is unknown.
+    """Return the PSNR of an image [cells, cells], dB; None where the truth is unknown or out of view.
 
     Args:
         capture: The capture.
@@ -349,15 +366,15 @@ def target_psnr(
         size_m: Its side, metres.
         motion: Its centre at the frames 1, 2, ..., [N, 2], metres.
     """
-    scene = capture.scene
-    if scene is None:
+    if (scene := capture.scene) is None:
         return None
-    sampling = Sampling()
+    times_s = capture.frame_times_us[1:] * 1e-6
+    sampling = scored_sampling(scene.target.size_m, scene.motion.position_m(times_s))
     target = Target("found", image.clamp(0, 1).float().numpy(), size_m)
-    drawn = target.rasterise(sampling.canvas, motion)
-    truth = scene.truth(sampling.canvas, capture.frame_times_us[1:] * 1e-6)
-    rows = sampling.scored
-    return round(float(psnr(torch.from_numpy(drawn[:, rows]), torch.from_numpy(truth[:, rows])).mean()), 3)
+    images = target.rasterise(sampling.canvas, motion), scene.truth(sampling.canvas, times_s)
+    values = psnr(*(torch.from_numpy(one[:, sampling.scored]) for one in images))
+    values = values[values.isfinite()]  # elsewhere the canvas shows nothing
+    return round(float(values.mean()), 3) if len(values) else None
 
 
 def confusion(seen: Sequence[dict[str, dict[str, int]]]) -> str:

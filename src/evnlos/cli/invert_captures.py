@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.analysis import target_psnr
+from evnlos.analysis import scored_sampling, target_psnr
 from evnlos.analysis.bounds import canvas_decibel
 from evnlos.calibration.scan.importer import stills_as_scanned
 from evnlos.cli.parsing import say
@@ -340,10 +340,11 @@ def _row(capture: Capture, found: SequenceEstimate, target_plane: Plane) -> dict
     assert capture.motion is not None
     size = target_plane.pitch_m * target_plane.width
     motion = capture.motion.position_m(capture.frame_times_us[1:] * 1e-6)
+    seen = scored_sampling(size, motion)
     row: dict[str, Any] = {
         "capture": capture.name,
         "psnr_db": target_psnr(capture, torch.from_numpy(found.image), size, motion),
-        "expected_db": round(canvas_decibel(found.expected_error, target_plane), 2),
+        "expected_db": round(canvas_decibel(found.expected_error, target_plane, seen), 2),
     }
     if capture.target is not None:
         truth = capture.target.rasterise(target_plane)
