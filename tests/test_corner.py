@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from PIL import Image
 import torch
+from PIL import Image
 
 from evnlos.cameras import FrameCamera
 from evnlos.cameras.video import film

@@ -17,6 +17,7 @@ from evnlos.analysis.bounds import canvas_decibel
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.cli.invert_captures import linear_setup
+from evnlos.cli.results import to_text
 from evnlos.config import read_yaml, save_yaml
 from evnlos.data import Capture, CaptureInfo, FixedPattern, Sampling, read_capture, save_pattern
 from evnlos.data.capture_info import CameraInfo
@@ -38,6 +39,7 @@ from evnlos.tracking import (
     Turn,
     count_targets,
     event_velocity,
+    first_paths,
     fit_motion,
     log_evidence,
     most_likely_acceleration,
@@ -669,7 +671,7 @@ def test_scores_do_not_depend_on_the_unit_of_length(capture, tmp_path) -> None:
         found.append(target_psnr(one, image, size_m, motion))
     assert np.allclose(found[:2], found[2], atol=0.002) and abs(found[3] - found[4]) < 0.002
     assert 10 < found[2] < 40
-    away = motion + [9.0, 0.0]
+    away = motion + np.array([9.0, 0.0])
     hidden = replace(one, target=replace(one.target, mask=np.zeros((4, 4))))
     assert target_psnr(hidden, image, size_m, away) is None  # nothing there, nothing drawn
     sizes = canvas_decibel(0.01, Plane(32, 32, 0.0025)), canvas_decibel(0.01, Plane(32, 32, 0.025))
@@ -877,6 +879,22 @@ def test_an_error_of_the_setup_is_no_second_object(monkeypatch, least, stated, f
     assert count_targets(torch.from_numpy(light), WIDE, times, 3e-4, 0.1, cells=10, most=2).found == found
 
 
+def test_objects_ten_times_as_large_and_as_far_are_followed_as_well() -> None:
+    """The law of units: nothing is looked for in metres of its own."""
+    light, times, _ = several_frames(2)
+    light = torch.from_numpy(light - WIDE.ambient_light().numpy())
+    large = replace(WIDE, cell_m=0.1, strip_m=(2.8, 1.6), distance_m=3.0, camera_distance_m=6.0)
+    found = []
+    for setup, size_m in ((WIDE, 0.1), (large, 1.0)):
+        start_m = first_paths(light, setup, 3e-3, size_m, 2)
+        fit = fit_motion(light, setup, start_m, 3e-3, size_m, 10, bend_m=size_m / 50)
+        evidence = log_evidence(fit, times, 3e-3)
+        place = plane_map(setup, (18, 28), size_m)(np.array([13.0, 9.0]))
+        found.append((start_m / size_m, fit.position_m / size_m, evidence, place / size_m))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-3)
+
+
 def test_several_objects_of_a_capture_are_followed_and_drawn(tmp_path, capsys, monkeypatch) -> None:
     (first, way), (second, back) = LETTERS
     setup = replace(WIDE, pixel=EventPixel(), frame_camera=FrameCamera(exposure_s=0.016))
@@ -917,3 +935,12 @@ def test_what_several_objects_need_is_named() -> None:
         track_several(capture, WIDE, Tracking(targets=2, depth=True))
     with pytest.raises(DataError, match="none: its frames show no noise"):
         track_several(replace(capture, frames=np.zeros(frames.shape, np.uint8)), WIDE, Tracking(targets="auto"))
+
+
+def test_lengths_from_a_metre_on_are_told_in_metres() -> None:
+    found = {
+        "capture": "far", "unit": "m", "frames": 2, "event_windows": 0, "travel": 1.59795, "direction_deg": 0.0,
+        "mean_speed": 0.2, "position_sigma": 0.004, "speed_sigma": 0.01, "size_change": 1.0, "picture": None,
+    }  # fmt: skip
+    told = to_text(found)
+    assert "1.598 m, direction" in told and "200.000 mm/s" in told and "4.000 mm standard" in told

@@ -336,6 +336,18 @@ def target_side_m(canvas: Plane) -> float:
     return _USUAL_SIDE_M if across <= 0.25 else across / 3
 
 
+def length_text(length: float, unit: str = "m", digits: int = 2) -> str:
+    """Return a length in words: metres as mm, from 1 m on as m; another unit as it is.
+
+    Example:
+        >>> length_text(0.15979), length_text(1.5979), length_text(3.25, "px", 1)
+        ('159.79 mm', '1.598 m', '3.2 px')
+    """
+    if unit == "m":
+        return f"{length:.{digits + 1}f} m" if abs(length) >= 0.9999 else f"{1e3 * length:.{digits}f} mm"
+    return f"{length:.{digits}f} {unit}"
+
+
 def matching_paths(given: Iterable[str | Path]) -> list[Path]:
     """Return paths in which a pattern, such as shots/*, stands for what it matches, as most shells have it.
 

@@ -374,13 +374,13 @@ def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool, warni
         as_json: Print one JSON object.
         warnings: Why paths may be wrong by more than they state.
     """
-    from evnlos.cli.results import track_values, true_path
+    from evnlos.cli.results import track_values
     from evnlos.plot.results import draw_inversion, draw_track
 
     rows, pictures = [], []
     for k, track in enumerate(found.tracks):
         known = [] if capture.scene is None else [capture.scene, *capture.others]
-        truths = [(one.target.name, true_path(one, track.time_s)) for one in known]
+        truths = [(one.target.name, one.light_m(track.time_s)) for one in known]
         nearest = min(truths, key=lambda one: float(np.square(one[1] - track.position).sum()), default=None)
         rows.append(track_values(capture, track, None if nearest is None else nearest[1]))
         rows[-1]["target"] = None if nearest is None else nearest[0]

@@ -385,16 +385,16 @@ def _check_writable(path: Path) -> None:
 
 def tracks_text(told: dict[str, Any]) -> str:
     """Return the figures of several objects as lines for people."""
+    from evnlos.types import length_text  # NumPy loads slowly
+
     lines = [f"{told['capture']}: {told['targets']} moving object{'s' * (told['targets'] != 1)}"]
     for k, gain in enumerate(told["evidence_gains"]):
         error = " and the setup's own error" if k else ""
         lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}{error}")
     for k, row in enumerate(told["objects"]):
-        travel, speed, sigma = (1e3 * row[name] for name in ("travel", "mean_speed", "position_sigma"))
-        lines.append(f"object {k + 1}    travel {travel:.1f} mm, {speed:.2f} mm/s, position +- {sigma:.2f} mm")
+        travel, speed, sigma = (length_text(row[name]) for name in ("travel", "mean_speed", "position_sigma"))
+        lines.append(f"object {k + 1}    travel {travel}, {speed}/s, position +- {sigma}")
         if row["target"] is not None:
-            x, y = (1e3 * one for one in row["position_offset"])
-            lines[-1] += (
-                f"; {row['target']}: error {1e3 * row['position_error']:.2f} mm rms about ({x:.2f}, {y:.2f})"
-            )
+            x, y, error = (length_text(one) for one in (*row["position_offset"], row["position_error"]))
+            lines[-1] += f"; {row['target']}: error {error} rms about ({x}, {y})"
     return "\n".join([*lines, *told["pictures"]])

@@ -26,7 +26,7 @@ from evnlos.errors import ConfigError, EvnlosError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
 from evnlos.tracking import Tracking
-from evnlos.types import OutFile, OutFolder, OutImage
+from evnlos.types import OutFile, OutFolder, OutImage, length_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from evnlos.analysis import Identification
     from evnlos.data import Capture
     from evnlos.data.lab import Lab
-    from evnlos.scene import Scene
     from evnlos.tracking import Track
 
 
@@ -173,7 +172,7 @@ class TrackCommand:
             odd = track_warnings(capture, setup, track.tracks[0]) if track.tracks else []
             show_tracks(capture, track, self.out, self.json, odd)
             return
-        truth = None if track.unit != "m" or capture.scene is None else true_path(capture.scene, track.time_s)
+        truth = None if track.unit != "m" or capture.scene is None else capture.scene.light_m(track.time_s)
         found = track_values(capture, track, truth)
         found["warnings"] = track_warnings(capture, setup, track)
         found["picture"] = drawn(self.out, lambda: draw_track(track, self.out, truth, capture.name))
@@ -182,16 +181,6 @@ class TrackCommand:
         print(json.dumps(found) if self.json else to_text(found))
         for warning in found["warnings"]:
             say(f"warning: {warning}")
-
-
-def true_path(scene: Scene, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the middle of the target's light, [T, 2], metres."""
-    mask = scene.target.mask.astype(np.float64)
-    along = ((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * scene.target.size_m
-    x, y = np.array([mask.sum(axis=0) @ along, mask.sum(axis=1) @ along]) / mask.sum()
-    pose = scene.pose(t_s)
-    cos, sin = np.cos(pose.rotation_rad), np.sin(pose.rotation_rad)
-    return np.stack([pose.x_m + cos * x - sin * y, pose.y_m + sin * x + cos * y], axis=-1)
 
 
 def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -> dict[str, Any]:
@@ -236,15 +225,18 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
 
 def to_text(found: dict[str, Any]) -> str:
     """Return the figures as lines for people."""
-    scale, unit = (1000.0, "mm") if found["unit"] == "m" else (1.0, "px")
+    unit = found["unit"]
+
+    def length(name: str, digits: int = 2, of: float | None = None) -> str:
+        return length_text(found[name] if of is None else of, unit, digits)
+
     lines = [
         f"{found['capture']}: {found['frames']} frames, {found['event_windows']} windows of events",
-        f"travel      {scale * found['travel']:8.2f} {unit}, direction {found['direction_deg']:.1f} deg"
-        + ("" if unit == "mm" else "; image pixels: give --setup for metres"),
-        f"mean speed  {scale * found['mean_speed']:8.3f} {unit}/s, "
-        f"+- {scale * found['speed_sigma']:.3f} at an instant",
-        f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation"
-        + (" by the noise; the setup's own errors come on top" if unit == "mm" else ""),
+        f"travel      {length('travel'):>11}, direction {found['direction_deg']:.1f} deg"
+        + ("" if unit == "m" else "; image pixels: give --setup for metres"),
+        f"mean speed  {length('mean_speed', 3):>11}/s, +- {length('speed_sigma', 3)}/s at an instant",
+        f"position    {length('position_sigma', 3):>11} standard deviation"
+        + (" by the noise; the setup's own errors come on top" if unit == "m" else ""),
         f"size        {found['size_change']:8.3f} at the end over the start",
     ]
     if "misfit" in found:
@@ -252,11 +244,10 @@ def to_text(found: dict[str, Any]) -> str:
             f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by target and setup"
         )
     if "distance" in found:
-        first, last = (scale * v for v in found["distance"])
+        first, last = (length("distance", of=v) for v in found["distance"])
         lines.append(
-            f"distance    {first:8.2f} {unit} at the start, {last:.2f} {unit} at the end, "
-            f"+- {scale * found['distance_sigma']:.2f} {unit}; "
-            f"{scale * found['distance_spread']:.2f} {unit} rms about its mean, which is the setup's"
+            f"distance    {first:>11} at the start, {last} at the end, +- {length('distance_sigma')}; "
+            f"{length('distance_spread')} rms about its mean, which is the setup's"
             + ("" if found["distance_identified"] else "; not identified: its changes drown in its error")
         )
     if "turn_deg" in found:
@@ -265,10 +256,10 @@ def to_text(found: dict[str, Any]) -> str:
             + ("" if found["turn_identified"] else "; not identified: this target shows no turn")
         )
     if "position_error" in found:
-        x, y = (scale * v for v in found["position_offset"])
+        x, y = (length("position_offset", of=v) for v in found["position_offset"])
         lines.append(
-            f"error       {scale * found['position_error']:8.3f} {unit} rms about an offset of "
-            f"({x:.2f}, {y:.2f}) {unit}; speed {found['speed_error_percent']:.2f} % rms"
+            f"error       {length('position_error', 3):>11} rms about an offset of ({x}, {y}); "
+            f"speed {found['speed_error_percent']:.2f} % rms"
         )
     return "\n".join([*lines, *([found["picture"]] if found["picture"] else [])])
 

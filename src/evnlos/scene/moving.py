@@ -335,6 +335,12 @@ class Target:
         rows = np.arange(len(self.mask)) * len(factors) // len(self.mask)
         return replace(self, mask=self.mask * factors[rows, None])
 
+    @property
+    def light_m(self) -> NDArray[np.float64]:
+        """Middle of its light from its centre (x, y), [2], metres."""
+        along, mask = ((np.arange(len(self.mask)) + 0.5) / len(self.mask) - 0.5), self.mask.astype(np.float64)
+        return self.size_m * np.array([mask.sum(axis=0) @ along, mask.sum(axis=1) @ along]) / mask.sum()
+
     def turned(self, rotation_rad: float) -> Target:
         """Return the target turned about its centre, on a larger plane; a coarse mask gets half the pixel.
 
@@ -503,6 +509,12 @@ class Scene:
         """Whether the target turns, or its distance from the wall changes, while it is watched."""
         pose = self.pose(self.instants(_PROBES))
         return bool(pose.rotation_rad.any() or np.ptp(pose.z_m) > 0)  # NaN is the setup's own distance
+
+    def light_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
+        """Return the middle of the target's light at times `t_s` (seconds, [N]), [N, 2], metres."""
+        (x, y), pose = self.target.light_m, self.pose(t_s)
+        cos, sin = np.cos(pose.rotation_rad), np.sin(pose.rotation_rad)
+        return np.stack([pose.x_m + cos * x - sin * y, pose.y_m + sin * x + cos * y], axis=-1)
 
     def truth(self, plane: Plane, t_s: ArrayLike) -> NDArray[np.float32]:
         """Return the target at times `t_s` (seconds, [] or [N]) on a plane, float32 [H, W] or [N, H, W]."""

@@ -298,7 +298,7 @@ def _in_metres(
     settings: Tracking,
 ) -> Track:
     shape = (small.shape[1], small.shape[2])
-    to_plane = plane_map(setup, shape)
+    to_plane = plane_map(setup, shape, settings.target_size_m)
     light = torch.from_numpy(small - found.background)
     start_m = to_plane(found.place_px)
     fitted = fit_motion(

@@ -27,8 +27,8 @@ from evnlos.types import Plane
 
 REACH = 0.3
 """Largest change of the distance's logarithm that is looked for: 0.74 to 1.35 of the setup's own distance."""
-REGION_M = (0.40, 0.28)
-"""Sides of the part of the target's plane in which several targets are looked for, (x, y), metres."""
+REGION = (4.0, 2.8)
+"""Sides of the part of the target's plane in which several targets are looked for, (x, y), over a target's."""
 MOST_TARGETS = 5
 """Largest number of targets that is looked for by evidence."""
 LEAST_ERROR = 0.01
@@ -39,9 +39,8 @@ _STRIDE = 3  # cells between two of them at most
 _BEND = 0.1  # what a bend of one cell costs, of the brightest score
 _STATIC = 1.0  # a pixel's constant offset over its noise
 _PRIOR = 3.0  # weight of the target's smoothness, in units of the noise's variance
-_MARGIN_M = 0.03
-_STRIP_M = 0.04
-_LONGEST_M = 0.01  # step of one round
+_MARGIN, _STRIP = 0.3, 0.4  # around the places, and steps of the strip, in sides of a target
+_LONGEST = 0.1  # step of one round, likewise
 _ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
 _WORSE = 2.0  # of one recording's share that its setup gets wrong, over that of all captures held out
 _UNTOLD = 1e-7  # share of a direction's information that the target leaves, below which it is not told
@@ -67,6 +66,7 @@ class MotionFit:
         volume: ln of how much the frames narrow down the target, a determinant over that of its prior.
         inside: As `misfit`, of what the strip can show of the frames, where the light is.
         noise: Standard deviation of a sample's noise that was taken for true, white levels.
+        size_m: Side of the target's array, metres.
     """
 
     position_m: NDArray[np.float64]
@@ -79,6 +79,7 @@ class MotionFit:
     volume: float = 0.0
     inside: float = 1.0
     noise: float = 1.0
+    size_m: float = 0.1
 
 
 def fit_motion(
@@ -116,11 +117,12 @@ def fit_motion(
     """
     target_plane = Plane(cells, cells, target_size_m / cells)
     places = start_m.reshape(-1, 2)
-    reach = np.concatenate([places + _MARGIN_M, places - _MARGIN_M])
+    margin_m, strip_m = _MARGIN * target_size_m, _STRIP * target_size_m
+    reach = np.concatenate([places + margin_m, places - margin_m])
     if turning:  # corners reach further
         reach = np.concatenate([reach + 0.21 * target_size_m, reach - 0.21 * target_size_m])
     # Whole steps: recordings alike share their matrices.
-    reach = np.stack([np.floor(reach.min(axis=0) / _STRIP_M), np.ceil(reach.max(axis=0) / _STRIP_M)]) * _STRIP_M
+    reach = np.stack([np.floor(reach.min(axis=0) / strip_m), np.ceil(reach.max(axis=0) / strip_m)]) * strip_m
     lights = Lights(setup, strip_of(reach, target_plane), (int(light.shape[1]), int(light.shape[2])), depth)
     seen = lights.seen(light)
     count, targets = len(start_m), len(places) // len(start_m)
@@ -147,7 +149,7 @@ def fit_motion(
         if straight := bend_m > 0 and number <= _STRAIGHT_ROUNDS:
             step = straightened(step, covariance, pose[..., kinds].reshape(count, many), bend_m / noise)
         step = step.reshape(count, targets, len(kinds))
-        step = step * np.minimum(1.0, _LONGEST_M / np.abs(step).max(axis=(0, 2), keepdims=True))
+        step = step * np.minimum(1.0, _LONGEST * target_size_m / np.abs(step).max(axis=(0, 2), keepdims=True))
         pose[..., kinds] += step / scale[kinds]
         pose[..., 2:] -= pose[..., 2:].mean(axis=0)
         pose[..., 2] = np.clip(pose[..., 2], -REACH, REACH)
@@ -166,6 +168,7 @@ def fit_motion(
         pose[..., 3].reshape(start_m.shape[:-1]) if turning else None,
         *told,
         noise,
+        target_size_m,
     )
 
 
@@ -179,7 +182,7 @@ def moving_energy(frames: torch.Tensor) -> float:
 def log_evidence(fit: MotionFit, times_s: NDArray[np.float64], noise: float) -> float:
     """Return ln of the probability density of the frames, up to what all numbers of targets share.
 
-    Targets are integrated out exactly, paths by Laplace's method: they may be anywhere in `REGION_M`, at any
+    Targets are integrated out exactly, paths by Laplace's method: they may be anywhere in `REGION`, at any
     velocity that crosses it, which walks at random by as much as makes the path likeliest (`smooth`).
 
     Args:
@@ -194,11 +197,11 @@ def log_evidence(fit: MotionFit, times_s: NDArray[np.float64], noise: float) -> 
     for k in range(0, many, 2):
         axes = [Measurements(times_s, places[:, k + j], variance[:, k + j], blank, blank) for j in range(2)]
         walk = _walk(times_s - times_s[0], np.zeros(count, bool), most_likely_acceleration(axes))
-        for j, side_m in enumerate(REGION_M):
+        for j, side_m in enumerate(fit.size_m * np.array(REGION)):
             line = side_m**2 / 12 + np.outer(passed, passed) * (side_m / np.ptp(times_s)) ** 2
             covered[:, k + j, :, k + j] = walk + line
     size, scale = count * many, (max(fit.misfit, 1.0) * fit.noise / noise) ** 2
-    root = np.linalg.cholesky(covered.reshape(size, size) + 1e-12 * np.eye(size))
+    root = np.linalg.cholesky(covered.reshape(size, size) + 1e-10 * fit.size_m**2 * np.eye(size))
     told = scale * np.linalg.pinv(fit.covariance.reshape(size, size), rcond=1e-10, hermitian=True)
     d = places.ravel()  # from the middle of the region
     within, b = np.eye(size) + root.T @ told @ root, root.T @ (told @ d)
@@ -282,7 +285,7 @@ def first_paths(
     from scipy.ndimage import gaussian_filter  # scipy loads slowly
 
     cell_m = target_size_m / 10
-    plane = Plane(round(REGION_M[1] / cell_m), round(REGION_M[0] / cell_m), cell_m)
+    plane = Plane(round(10 * REGION[1]), round(10 * REGION[0]), cell_m)
     shape = (int(light.shape[1]), int(light.shape[2]))
     matrix = setup.seen_by(shape).operator(plane, shape).dense()
     prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape).double())
@@ -557,9 +560,7 @@ def smooth_together(
         seen.append(np.concatenate([values[:, k] - middle[k], told]))
         spread.append(_walk(t, is_rate, accelerations[k]))
         noise.append(np.concatenate([np.zeros(count), variance]))
-        lines.append(
-            np.stack([~is_rate, np.where(is_rate, 1.0, t)], axis=1)
-        )  # of the first value, the first rate
+        lines.append(np.stack([~is_rate, np.where(is_rate, 1.0, t)], axis=1))  # of the first value and rate
     starts = np.concatenate([[0], np.cumsum([len(one) for one in seen])])
     whole, basis = np.zeros((starts[-1], starts[-1])), np.zeros((starts[-1], 2 * kinds))
     for k in range(kinds):
@@ -573,7 +574,7 @@ def smooth_together(
     told = np.linalg.inv(basis.T @ inverse @ basis)  # covariance of first values and rates
     line = told @ (basis.T @ (inverse @ np.concatenate(seen)))
     pulled = inverse @ (np.concatenate(seen) - basis @ line)
-    mean, sigma = np.empty((len(at_s), 2, kinds)), np.empty((len(at_s), 2, kinds))
+    mean, sigma = np.empty((2, len(at_s), 2, kinds))
     for k in range(kinds):
         own, size = slice(starts[k], starts[k + 1]), len(seen[k])
         cross = spread[k][size:, :size]  # [2 T, own]
@@ -582,9 +583,7 @@ def smooth_together(
         left = np.diagonal(spread[k])[size:] - np.einsum("ta,ab,tb->t", cross, inverse[own, own], cross)
         left = left + np.einsum("ta,ab,tb->t", ways, told, ways)
         found = cross @ pulled[own] + lines[k][size:] @ line[2 * k : 2 * k + 2]
-        mean[:, :, k], sigma[:, :, k] = (
-            one.reshape(2, -1).T for one in (found, np.sqrt(np.maximum(left, 0.0)))
-        )
+        mean[:, :, k], sigma[:, :, k] = (v.reshape(2, -1).T for v in (found, np.sqrt(np.maximum(left, 0.0))))
         mean[:, 0, k] += middle[k]
     return mean, sigma
 

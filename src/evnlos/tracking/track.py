@@ -18,8 +18,7 @@ from evnlos.setups import Setup
 from evnlos.tracking.registration import middle_of_light
 from evnlos.types import Plane
 
-_REACH_M = (0.40, 0.28)  # region of the target's plane that the map is fitted on, (x, y)
-_CELL_M = 0.02
+_REACH = (20, 14)  # cells of the target's plane that the map is fitted on, (x, y), five to a target's side
 _SEEN = 0.2  # of the brightest cell's light; darker cells lie partly outside the image
 
 
@@ -54,17 +53,18 @@ class PlaneMap:
         return (place_px - middle) / (self.shape[1] / 2)
 
 
-def plane_map(setup: Setup, shape: tuple[int, int]) -> PlaneMap:
+def plane_map(setup: Setup, shape: tuple[int, int], target_size_m: float = 0.1) -> PlaneMap:
     """Fit the map to the images of small cells all over the target's plane.
 
     Args:
         setup: The setup.
         shape: Size (H, W) of the image, pixels.
+        target_size_m: Side of a target plane, metres: the map is fitted on 4 x 2.8 of them.
 
     Raises:
         DataError: The middle of the light hardly moves with the cell: a matte wall shows no place that way.
     """
-    cells = Plane(round(_REACH_M[1] / _CELL_M), round(_REACH_M[0] / _CELL_M), _CELL_M)
+    cells = Plane(_REACH[1], _REACH[0], target_size_m / 5)
     pictures = setup.matrix(shape, cells).mT.reshape(-1, *shape).numpy()
     light = pictures.sum(axis=(1, 2))
     border = np.concatenate([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], axis=1)
