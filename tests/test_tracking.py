@@ -497,6 +497,7 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
     assert found["travel"] == pytest.approx(0.08, rel=0.05)
     assert found["mean_speed"] == pytest.approx(0.02, rel=0.1)
     assert found["position_error"] < 2e-3
+    assert found["psnr_db"] > 13 and found["image"].endswith("t_image.png")
     assert (tmp_path / "t.png").exists()
     track = json.loads((tmp_path / "t.json").read_text())["track"]
     assert len(track["frame_time_s"]) == 9 and "distance" not in track
@@ -513,7 +514,10 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
             str(tmp_path / "d.png"),
         ]
     )
-    assert "distance " in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "distance " in told and re.search(r"image       at its mean distance and turn, PSNR [\d.]+ dB", told)
+    assert (tmp_path / "d_image.png").is_file()
+    assert np.load(tmp_path / "d_image.npz")["image"].shape == (32, 32)
     away = json.loads((tmp_path / "d.json").read_text())["track"]["distance"]
     assert np.mean(away["distance_m"]) == pytest.approx(SETUP.distance_m, rel=0.02)
     assert np.std(away["distance_m"]) < 0.01

@@ -1,4 +1,4 @@
-"""`evnlos corner`: an ordinary video of the floor in, who moves behind the corner out; or one is filmed."""
+"""`evnlos corner`: a video of the floor in, who moves behind the corner out; and images that `track` found."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -23,6 +23,10 @@ from evnlos.machine import ProgressBars, counted
 from evnlos.tracking import UNSURE_NOISE, BearingTracking, BearingTracks
 from evnlos.types import OutFolder
 from evnlos.untrusted import open_regular
+
+if TYPE_CHECKING:
+    from evnlos.data import Capture
+    from evnlos.tracking import Track
 
 _DISTURBED, _SHAKE_PX, _NOISE, _GAIN = 0.02, 0.3, 3.0, 0.01  # beyond these a warning is due
 
@@ -372,3 +376,25 @@ def _errors(tracks: BearingTracks, truth: NDArray[np.float64]) -> list[dict[str,
         within = np.abs(row[known]) <= 1.645 * track.deviation_deg[known]
         found.append({"rms": float(np.sqrt(np.mean(row[known] ** 2))), "within_90": float(within.mean())})
     return found
+
+
+def show_image(capture: Capture, track: Track, path: Path) -> tuple[str | None, float | None]:
+    """Write the image of a track and its array; return its path, as `drawn`, and its PSNR, dB, where known."""
+    import torch
+
+    from evnlos.analysis import scored_sampling
+    from evnlos.cli.invert import save_arrays
+    from evnlos.metrics import psnr
+    from evnlos.plot.results import draw_inversion
+    from evnlos.scene import Target
+
+    assert track.image is not None
+    save_arrays(path, {"image": track.image})
+    panels, known = [("found", torch.from_numpy(track.image)[None])], None
+    if (scene := capture.scene) is not None:
+        true = scene.target.turned(float(np.mean(scene.pose(track.frame_time_s).rotation_rad)))
+        found = Target("found", track.image.clip(0, 1).astype(np.float32), track.size_m)
+        sampling = scored_sampling(scene.target.size_m)
+        shown = found.rasterise(sampling.canvas), true.rasterise(sampling.canvas, -true.light_m)
+        known = round(float(psnr(*(torch.from_numpy(one[sampling.scored]) for one in shown))), 3)
+    return drawn(path, lambda: draw_inversion(path, panels)), known

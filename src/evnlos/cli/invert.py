@@ -166,7 +166,7 @@ class InvertCommand:
             for name, row in found["solutions"].items()
         ]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        _save_arrays(self.out, {name: solution.image for name, solution in solved.items()})
+        save_arrays(self.out, {name: solution.image for name, solution in solved.items()})
         found["seconds"] = round(time.perf_counter() - clock, 1)
         print(json.dumps(found) if self.json else to_text(found))
 
@@ -190,7 +190,7 @@ class InvertCommand:
             for file, image in zip(self.files, images, strict=True)
         ]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        _save_arrays(self.out, pictures)
+        save_arrays(self.out, pictures)
         found["file"] = " ".join(found["files"])
         print(json.dumps(found) if self.json else to_text(found))
 
@@ -224,7 +224,7 @@ class InvertCommand:
         best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
         panels = [(name, image if self.colours else image[None]) for name, image in best.items()]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        _save_arrays(self.out, pictures)
+        save_arrays(self.out, pictures)
         if levels := [row["level"] for row in found["rows"] if self.colours and None not in row["level"]]:
             say("red, green, blue are {:.2f}, {:.2f}, {:.2f} of the truth".format(*np.mean(levels, axis=0)))
         left = work.shares_left(found["rows"]).values()
@@ -276,7 +276,7 @@ class InvertCommand:
             "picture": drawn(self.out, lambda: draw_inversion(self.out, panels)),
         }
         arrays = {"times_s": found.times_s, "film": found.mean, "film_deviation": found.deviation}
-        _save_arrays(self.out, arrays)
+        save_arrays(self.out, arrays)
         result["seconds"] = round(time.perf_counter() - clock, 1)
         print(json.dumps(result) if self.json else film_text(result))
 
@@ -294,11 +294,11 @@ class InvertCommand:
             say(f"warning: {doubt}")
         panels = [(name, image[None]) for name, image in pictures.items()]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        _save_arrays(self.out, pictures)
+        save_arrays(self.out, pictures)
         print(json.dumps(found) if self.json else sequence_text(found))
 
 
-def _save_arrays(picture: Path, arrays: Mapping[str, torch.Tensor | NDArray]) -> None:
+def save_arrays(picture: Path, arrays: Mapping[str, torch.Tensor | NDArray]) -> None:
     """Write arrays as NPZ beside the image that shows them, without spaces in their names."""
     content = io.BytesIO()
     named: dict[str, Any] = {name.replace(" ", "_"): np.asarray(one) for name, one in arrays.items()}
@@ -390,7 +390,7 @@ def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool, warni
         panels = [(f"object {k + 1}", torch.from_numpy(one)[None]) for k, one in enumerate(found.images)]
         path = out.with_stem(f"{out.stem}_images")
         pictures.append(drawn(path, partial(draw_inversion, path, panels)))
-        _save_arrays(path, {f"object_{k + 1}": one for k, one in enumerate(found.images)})
+        save_arrays(path, {f"object_{k + 1}": one for k, one in enumerate(found.images)})
     told = {"capture": capture.name, "targets": len(rows), "evidence_gains": list(found.gains), "objects": rows}
     told |= {"image_size_m": found.size_m, "pictures": [one for one in pictures if one], "warnings": warnings}
     text = json.dumps({**told, "tracks": [track.summary() for track in found.tracks]})

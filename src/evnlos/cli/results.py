@@ -137,7 +137,8 @@ class TrackCommand:
     """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup. By default that
     of a calibrated --setup."""
     out: OutImage = Path("track.png")
-    """The image; the numbers go to the same name with .json."""
+    """The figure; the numbers go to the same name with .json. With a setup NAME_image.png, NAME_image.npz
+    (several targets: NAME_images) show what moves."""
     force: Force = False
     json: bool = False
     """Print one JSON object."""
@@ -151,14 +152,17 @@ class TrackCommand:
 
     def run(self) -> None:
         """Follow, print, write the image."""
+        from evnlos.cli.corner import show_image
         from evnlos.cli.invert import show_tracks
         from evnlos.cli.invert_captures import linear_setup
         from evnlos.data import pattern_of, read_capture
         from evnlos.plot.results import draw_track
         from evnlos.tracking import Tracks, track_capture, track_several, track_warnings
 
-        if self.settings.targets != 1:
-            refuse_existing(self.force, *(self.out.with_stem(f"{self.out.stem}_{k}") for k in (1, "images")))
+        image_path = self.out.with_stem(f"{self.out.stem}_image")
+        if self.setup is not None or self.settings.targets != 1:
+            ends = ("image",) if self.settings.targets == 1 else ("1", "images")
+            refuse_existing(self.force, *(self.out.with_stem(f"{self.out.stem}_{k}") for k in ends))
         with ProgressBars() as progress:
             with progress.stage("track", "read the capture", 0, 3):
                 capture = read_capture(self.capture, needs_events=False)
@@ -176,6 +180,8 @@ class TrackCommand:
         found = track_values(capture, track, truth)
         found["warnings"] = track_warnings(capture, setup, track)
         found["picture"] = drawn(self.out, lambda: draw_track(track, self.out, truth, capture.name))
+        if track.image is not None:
+            found["image"], found["psnr_db"] = show_image(capture, track, image_path)
         text = json.dumps({**found, "track": track.summary()})
         write_atomically(self.out.with_suffix(".json"), text.encode())
         print(json.dumps(found) if self.json else to_text(found))
@@ -261,7 +267,10 @@ def to_text(found: dict[str, Any]) -> str:
             f"error       {length('position_error', 3):>11} rms about an offset of ({x}, {y}); "
             f"speed {found['speed_error_percent']:.2f} % rms"
         )
-    return "\n".join([*lines, *([found["picture"]] if found["picture"] else [])])
+    if "image" in found:
+        known = found["psnr_db"]
+        lines.append("image       at its mean distance and turn" + (f", PSNR {known:.2f} dB" if known else ""))
+    return "\n".join([*lines, *(found[name] for name in ("picture", "image") if found.get(name))])
 
 
 @dataclass(frozen=True)

@@ -302,15 +302,9 @@ def _in_metres(
     light = torch.from_numpy(small - found.background)
     start_m = to_plane(found.place_px)
     fitted = fit_motion(
-        light,
-        setup,
-        start_m,
-        noise,
-        settings.target_size_m,
-        settings.cells,
-        depth=settings.depth,
-        turning=settings.turning,
-    )
+        light, setup, start_m, noise, settings.target_size_m, settings.cells,
+        depth=settings.depth, turning=settings.turning, image_cells=_IMAGE_CELLS,
+    )  # fmt: skip
     variance = np.einsum("nknk->nk", fitted.covariance)
     values = np.column_stack(
         [fitted.position_m, *(one for one in (fitted.log_distance, fitted.rotation_rad) if one is not None)]
@@ -340,7 +334,8 @@ def _in_metres(
         distance = Distance(times_s, away, away * log_sigma, away * rate, away * rate_sigma)
     if fitted.rotation_rad is not None:
         turn = Turn(times_s, *(np.degrees(one) for one in curves[-1]))
-    return replace(track, distance=distance, turn=turn, misfit=fitted.misfit)
+    image = {"image": fitted.target.numpy(), "size_m": fitted.size_m}
+    return replace(track, distance=distance, turn=turn, misfit=fitted.misfit, **image)
 
 
 def _instants(times_s: NDArray[np.float64], by_events: EventVelocity | None) -> NDArray[np.float64]:

@@ -39,8 +39,7 @@ _STRIDE = 3  # cells between two of them at most
 _BEND = 0.1  # what a bend of one cell costs, of the brightest score
 _STATIC = 1.0  # a pixel's constant offset over its noise
 _PRIOR = 3.0  # weight of the target's smoothness, in units of the noise's variance
-_MARGIN, _STRIP = 0.3, 0.4  # around the places, and steps of the strip, in sides of a target
-_LONGEST = 0.1  # step of one round, likewise
+_MARGIN, _STRIP, _LONGEST = 0.3, 0.4, 0.1  # around places, of the strip, of a round: in sides of a target
 _ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
 _WORSE = 2.0  # of one recording's share that its setup gets wrong, over that of all captures held out
 _UNTOLD = 1e-7  # share of a direction's information that the target leaves, below which it is not told
@@ -94,6 +93,7 @@ def fit_motion(
     turning: bool = False,
     rounds: int = _ROUNDS,
     bend_m: float = 0.0,
+    image_cells: int | None = None,
 ) -> MotionFit:
     """Find the poses of a target, and the target, that explain the frames best: Gauss and Newton's method.
 
@@ -114,6 +114,7 @@ def fit_motion(
         rounds: Most steps.
         bend_m: Above 0: standard deviation of a path's second difference in the first rounds, metres, which
             carries it through frames in which another target hides where it is.
+        image_cells: Cells a side of the target that is returned, solved anew at the poses; None: `cells`.
     """
     target_plane = Plane(cells, cells, target_size_m / cells)
     places = start_m.reshape(-1, 2)
@@ -126,8 +127,7 @@ def fit_motion(
     lights = Lights(setup, strip_of(reach, target_plane), (int(light.shape[1]), int(light.shape[2])), depth)
     seen = lights.seen(light)
     count, targets = len(start_m), len(places) // len(start_m)
-    prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(target_plane.shape).double())
-    prior = torch.block_diag(*[prior] * targets)
+    prior = torch.block_diag(*[_smooth(target_plane, noise)] * targets)
     pose = np.zeros((count, targets, 4))  # x, y, ln(distance / own), turn
     pose[..., :2] = places.reshape(count, targets, 2)
     kinds = [0, 1, *([2] if depth else []), *([3] if turning else [])]
@@ -157,19 +157,20 @@ def fit_motion(
         sigma = noise * np.sqrt(np.einsum("nknk->nk", covariance)).reshape(step.shape)
         if not straight and (np.abs(step) < _ENOUGH * sigma).all():
             break
+    if image_cells is not None:
+        target_plane = Plane(image_cells, image_cells, target_size_m / image_cells)
+        prior = torch.block_diag(*[_smooth(target_plane, noise)] * targets)
+        image = Fit(target_plane, lights, pose, kinds, scale).step(seen, prior)[0]
     # Pixels that no target reaches hold the noise alone: a setup that explains all leaves just that.
     unit = np.tile(scale[kinds], targets)
     covariance = (max(told[0], 1.0) * noise) ** 2 * covariance / unit[:, None, None] / unit
-    return MotionFit(
-        pose[..., :2].reshape(start_m.shape),
-        covariance,
-        image if start_m.ndim > 2 else image[0],
-        pose[..., 2].reshape(start_m.shape[:-1]) if depth else None,
-        pose[..., 3].reshape(start_m.shape[:-1]) if turning else None,
-        *told,
-        noise,
-        target_size_m,
-    )
+    away, turn = (pose[..., k].reshape(start_m.shape[:-1]) if k in kinds else None for k in (2, 3))
+    place, image = pose[..., :2].reshape(start_m.shape), image if start_m.ndim > 2 else image[0]
+    return MotionFit(place, covariance, image, away, turn, *told, noise, target_size_m)
+
+
+def _smooth(plane: Plane, noise: float) -> torch.Tensor:
+    return _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape).double())
 
 
 def moving_energy(frames: torch.Tensor) -> float:
@@ -288,7 +289,7 @@ def first_paths(
     plane = Plane(round(10 * REGION[1]), round(10 * REGION[0]), cell_m)
     shape = (int(light.shape[1]), int(light.shape[2]))
     matrix = setup.seen_by(shape).operator(plane, shape).dense()
-    prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape).double())
+    prior = _smooth(plane, noise)
     used = np.unique(np.linspace(0, len(light) - 1, min(len(light), _FIRST_FRAMES)).round().astype(int))
     back = matrix.mT @ light[torch.from_numpy(used)].double().flatten(1).mT
     shown = torch.linalg.solve(prior + matrix.mT @ matrix, back).mT.unflatten(1, plane.shape).numpy()

@@ -276,8 +276,9 @@ class Track:
         event_windows: Number of velocities that came from events.
         distance: Distance from the wall, where it was looked for.
         turn: Turn about the wall's normal, where it was looked for.
-        misfit: With a setup: what it leaves of the frames' changes, over their noise, root mean square. The
-            stated deviations hold it like noise.
+        misfit: With a setup: what it leaves of the frames' changes over their noise, rms; deviations hold it.
+        image: Likewise, one object's brightness at its mean distance and turn, as in `Tracks`, float64 [n, n].
+        size_m: Side of the image, metres.
     """
 
     time_s: NDArray[np.float64]
@@ -295,6 +296,8 @@ class Track:
     distance: Distance | None = None
     turn: Turn | None = None
     misfit: float | None = None
+    image: NDArray[np.float64] | None = None
+    size_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.time_s)
