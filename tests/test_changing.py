@@ -229,6 +229,9 @@ def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.Ca
     rest = truth - truth.mean(axis=0)
     assert ((arrays["film"] - truth) ** 2).mean() < 0.04
     assert np.corrcoef((arrays["film"] - arrays["film"].mean(axis=0)).ravel(), rest.ravel())[0, 1] > 0.7
+    assert found["animation"] == str(tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as animation:
+        assert animation.size == (128, 128) and animation.n_frames == len(truth)
     inside = np.abs(arrays["film"] - truth) <= 1.645 * arrays["film_deviation"]
     assert inside.mean() > 0.85
     with pytest.raises(SystemExit):

@@ -372,7 +372,8 @@ def target_psnr(
     sampling = scored_sampling(scene.target.size_m, scene.motion.position_m(times_s))
     target = Target("found", image.clamp(0, 1).float().numpy(), size_m)
     images = target.rasterise(sampling.canvas, motion), scene.truth(sampling.canvas, times_s)
-    values = psnr(*(torch.from_numpy(one[:, sampling.scored]) for one in images))
+    found, true = (torch.from_numpy(one[:, sampling.scored]) for one in images)
+    values = psnr(found, true)
     values = values[values.isfinite()]  # elsewhere the canvas shows nothing
     return round(float(values.mean()), 3) if len(values) else None
 

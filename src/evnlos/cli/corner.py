@@ -388,13 +388,13 @@ def show_image(capture: Capture, track: Track, path: Path) -> tuple[str | None, 
     from evnlos.plot.results import draw_inversion
     from evnlos.scene import Target
 
-    assert track.image is not None
-    save_arrays(path, {"image": track.image})
-    panels, known = [("found", torch.from_numpy(track.image)[None])], None
+    picture, known = np.asarray(track.image), None
+    save_arrays(path, {"image": picture})
     if (scene := capture.scene) is not None:
         true = scene.target.turned(float(np.mean(scene.pose(track.frame_time_s).rotation_rad)))
-        found = Target("found", track.image.clip(0, 1).astype(np.float32), track.size_m)
-        sampling = scored_sampling(scene.target.size_m)
-        shown = found.rasterise(sampling.canvas), true.rasterise(sampling.canvas, -true.light_m)
-        known = round(float(psnr(*(torch.from_numpy(one[sampling.scored]) for one in shown))), 3)
-    return drawn(path, lambda: draw_inversion(path, panels)), known
+        found = Target("found", picture.clip(0, 1).astype(np.float32), track.size_m)
+        canvas, rows = (sampling := scored_sampling(scene.target.size_m)).canvas, sampling.scored
+        shown = found.rasterise(canvas), true.rasterise(canvas, -true.light_m)
+        image, truth = (torch.from_numpy(one[rows]) for one in shown)
+        known = round(float(psnr(image, truth)), 3)
+    return drawn(path, lambda: draw_inversion(path, [("found", torch.from_numpy(picture)[None])])), known

@@ -17,7 +17,7 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from evnlos.cli.parsing import check_files, drawn, say, tracks_text
+from evnlos.cli.parsing import check_files, drawn, refuse_existing, say, tracks_text
 from evnlos.cli.recordings import Folders, Force
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
@@ -70,7 +70,8 @@ class InvertCommand:
     thresholds and the optics of this very sensor: it is said where they do not fit."""
     changing: tuple[float, float] | None = None
     """One capture: nothing moves as a whole; estimate a film of a hidden plane of this width and height,
-    metres, whose middle is that of the setup's target plane: an image per frame, with an error of each cell."""
+    metres, whose middle is that of the setup's target plane: an image per frame, with an error of each cell,
+    and a NAME.gif that shows them."""
     solver: Literal["all", "tikhonov", "tv"] = "all"
     """Smooth (`tikhonov`), sharp and not below 0 (`tv`), or both and, as a control, without the occluders."""
     regularization: str = "cv"
@@ -98,12 +99,8 @@ class InvertCommand:
 
     def run(self) -> None:
         """Invert, print the figures, write the image."""
-        for flag, value, least in (
-            ("cells", self.cells, 2),
-            ("columns", self.columns, 2),
-            ("subsets", self.subsets, 1),
-        ):
-            if value < least:
+        for flag, least in (("cells", 2), ("columns", 2), ("subsets", 1)):
+            if (value := getattr(self, flag)) < least:
                 raise ConfigError(f"--{flag} is {value}; give {least} or more")
         if self.regularization == "gcv" and self.solver != "tikhonov":
             raise ConfigError("--regularization gcv serves --solver tikhonov only; give that, or a number")
@@ -114,11 +111,8 @@ class InvertCommand:
             (self._invert_stills if still else self._invert_captures)(self.setup)
             return
         if len(self.files) != 1 or self.files[0].is_dir():
-            given = (
-                f"{self.files[0]} is a folder"
-                if len(self.files) == 1
-                else f"{len(self.files)} files or folders"
-            )
+            one = len(self.files) == 1
+            given = f"{self.files[0]} is a folder" if one else f"{len(self.files)} files or folders"
             cure = "give one NPZ file, or capture folders and their --setup, e.g. main-near"
             raise ConfigError(f"{given}, without --setup; {cure}")
         from evnlos.cli.invert_captures import figures_of
@@ -238,8 +232,10 @@ class InvertCommand:
         from evnlos.data.fixed_pattern import object_light
         from evnlos.inverse import estimate_film
         from evnlos.plot.results import draw_inversion
+        from evnlos.report.pictures import grey, save_animation
         from evnlos.types import Plane
 
+        refuse_existing(self.force, film := self.out.with_suffix(".gif"))
         if len(self.files) != 1 or self.evidence is not None or self.positions or self.track:
             raise ConfigError("--changing takes the frames of one capture; leave --from, --positions, --track")
         if not (min(sides_m) > 0 and max(sides_m) < np.inf and self.cells >= 2):
@@ -274,7 +270,10 @@ class InvertCommand:
             "static": found.static,
             "evidence": found.evidence,
             "picture": drawn(self.out, lambda: draw_inversion(self.out, panels)),
+            "animation": str(film),
         }
+        rate_hz = max(len(found.mean) - 1, 1) / max(float(np.ptp(found.times_s)), 0.02)
+        save_animation(film, [grey(one) for one in found.mean], rate_hz, zoom=8)
         arrays = {"times_s": found.times_s, "film": found.mean, "film_deviation": found.deviation}
         save_arrays(self.out, arrays)
         result["seconds"] = round(time.perf_counter() - clock, 1)
@@ -337,8 +336,8 @@ def film_text(found: dict[str, Any]) -> str:
     ]
     if found["noise_factor"] > _EXPLAINED or prior["deviation"] > _BRIGHTEST:
         lines.append("warning: no plane here explains the frames; give a larger one, or check the setup")
-    lines.append("; ".join([*([found["picture"]] if found["picture"] else []), f"{found['seconds']} s"]))
-    return "\n".join(lines)
+    made = [found[name] for name in ("picture", "animation") if found.get(name)]
+    return "\n".join([*lines, "; ".join([*made, f"{found['seconds']} s"])])
 
 
 def _weight(text: str) -> tuple[float | None, Literal["cv", "gcv", "discrepancy"]]:
