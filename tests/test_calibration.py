@@ -54,7 +54,7 @@ SETUP = RadiometricSetup(
     ambient_gradient=(0.3, -0.2),
 )
 CAMERA = FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0, prnu=0.02, dsnu_e=30.0)
-PIXEL = EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0)
+PIXEL = EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0, initial_phase="rest")
 LAB = Lab(
     glyphs=FontGlyphs(family="kalam", characters="ALT4EO"),
     setup=replace(SETUP, sensor=SensorSize(50, 80), frame_camera=CAMERA, pixel=PIXEL),
@@ -134,7 +134,7 @@ def test_pixel_comes_back(fit) -> None:
     assert pixel.threshold_off == pytest.approx(PIXEL.threshold_off, rel=0.06)
     assert pixel.threshold_sigma == pytest.approx(PIXEL.threshold_sigma, abs=0.015)
     assert pixel.shot_noise_rate_hz == pytest.approx(PIXEL.shot_noise_rate_hz, rel=0.1)
-    assert pixel.leak_rate_hz < 0.08
+    assert pixel.leak_rate_hz < 0.08 and pixel.initial_phase == "rest"
     assert pixel.leak_rate_hz == 0 or pixel.leak_rate_hz >= fit.pixel.error["leak_rate_hz"]
     for kind in ("counts", "surfaces"):
         found = fit.residuals[f"{kind} held out"]

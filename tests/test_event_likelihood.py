@@ -161,15 +161,17 @@ def test_many_noise_events_are_told_from_signals(from_truth: bool) -> None:
 
 def test_noise_that_carries_crossings_ahead_is_no_contrast() -> None:
     """A turn of the light then needs less than a threshold; who does not know it is further from the truth."""
-    law, found = DIM.crossing_law(40.0), {}
+    law, errors, covered = DIM.crossing_law(40.0), {}, {}
     assert 0.02 < law.ahead < 0.06
     for ahead in (0.0, law.ahead):
         known = replace(law, ahead=ahead)
-        ones = [estimate_sequence(light(), prior(), known, recorded(seed, DIM)) for seed in range(4)]
+        ones = [estimate_sequence(light(), prior(), known, recorded(seed, DIM)) for seed in range(12)]
         away = [np.abs(one.image - prior().image(truth(s))) / one.deviation for s, one in enumerate(ones)]
-        found[ahead] = np.mean([error(one, s) for s, one in enumerate(ones)]), np.mean(np.array(away) < 1.645)
-    (before, covered_before), (after, covered) = found.values()
-    assert 10 * np.log10(before / after) > 1.0 and covered > max(covered_before, 0.8)
+        errors[ahead] = np.array([error(one, s) for s, one in enumerate(ones)])
+        covered[ahead] = np.mean(np.array(away) < 1.645)
+    gains = 10 * np.log10(errors[0.0] / errors[law.ahead])
+    assert gains.mean() > 0.5 and gains.mean() > 3 * gains.std() / np.sqrt(len(gains))
+    assert covered[law.ahead] > max(covered[0.0], 0.8)
 
 
 def test_it_stays_at_the_truth() -> None:

@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from evnlos.calibration import Calibration, fit_setup
+from evnlos.calibration import Calibration, fit_setup, steps_table
 from evnlos.calibration.captures import CaptureSet, grouped, wall_data
-from evnlos.calibration.summary import steps_table
 from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
 from evnlos.calibration.wall_search import fit_wall, travelled

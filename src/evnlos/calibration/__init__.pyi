@@ -41,6 +41,7 @@ from .summary import calibration_values as calibration_values
 from .summary import expectation as expectation
 from .summary import residual_table as residual_table
 from .summary import rows_of as rows_of
+from .summary import steps_table as steps_table
 from .summary import table as table
 from .summary import warnings_of as warnings_of
 from .summary import write_setup as write_setup

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,23 +28,23 @@ from evnlos.calibration.event_statistics import (
     simulated,
     thinned,
 )
-from evnlos.calibration.transport_fit import forward_jacobian, levenberg_marquardt
+from evnlos.calibration.transport_fit import Residual, forward_jacobian, levenberg_marquardt
 from evnlos.cameras import EventPixel, PixelSettings
 from evnlos.config import load_yaml
 from evnlos.data import Simulation, read_capture
 from evnlos.data.pool import run_in_order
 from evnlos.errors import ConfigError
-from evnlos.inverse.event_images import (
-    EVENT_ERRORS_FILE,
-    EventErrors,
-    event_statistic,
-)
+from evnlos.inverse.event_images import EVENT_ERRORS_FILE, EventErrors, event_statistic
 from evnlos.inverse.prior import PatternPrior
 from evnlos.inverse.sequence_statistic import EventStatistic
 from evnlos.machine import Progress, Step, note, silent
 from evnlos.setups import calibrated_file
 from evnlos.types import Events, target_side_m
 
+EVENT_RESIDUALS = ("counts held out", "surfaces held out")
+"""Residuals that the event pixel decides; where they got worse the light path still stands."""
+
+_MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25  # times the noise, beside it
 _LOG_NAMES = ("threshold_on", "threshold_off", "threshold_sigma", "shot_noise_rate_hz")
 _NAMES = (*_LOG_NAMES, "leak_rate_hz")
 _STEPS = (0.05, 0.05, 0.2, 0.1, 0.03)
@@ -91,8 +91,8 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     Six figures of the recordings (`MOMENTS`) must agree with those of simulated events under the fitted light.
     The same random draws are used for every trial, so the figures change smoothly with the settings. The cutoff
     shows only in when events come, so it is chosen by a map of counts in tenths of a second. A leak below its
-    standard error is taken for none: even the smallest one lets the pixels start at times of their own. The
-    refractory period is left as it is: only a bound can be told.
+    standard error is taken for none. The first state is the one of the two whose events are nearer to those
+    recorded (`misfit`). The refractory period is left as it is: only a bound can be told.
 
     Args:
         recordings: Light and events.
@@ -112,7 +112,9 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     pixel, values = _match(recordings, regions, observed, replace(pixel, cutoff_hz=cutoff), seed, 2)
     error = _errors(recordings, regions, pixel, values, seed)
     if pixel.leak_rate_hz < error["leak_rate_hz"]:
-        pixel = replace(pixel, leak_rate_hz=0.0, initial_phase="rest")  # not told from none: at rest at first
+        pixel = replace(pixel, leak_rate_hz=0.0)  # not told from none
+    begun = (replace(pixel, initial_phase=phase) for phase in ("random", "rest"))
+    pixel = min(begun, key=lambda one: float(misfit(recordings, one, seed).sum()))
     edge = tuple(
         n for n in ("threshold_on", "threshold_off") if math.log(getattr(pixel, n)) > _HIGHEST[0] - 0.02
     )
@@ -174,11 +176,9 @@ def _first_guess(
 
 
 def _with(pixel: EventPixel, values: NDArray[np.float64]) -> EventPixel:
-    chosen = {
-        name: float(v) if name not in _LOG_NAMES else math.exp(v)
-        for name, v in zip(_NAMES, values, strict=True)
-    }
-    phase = "random" if chosen["leak_rate_hz"] > 0 else "rest"
+    named = zip(_NAMES, values, strict=True)
+    chosen = {name: math.exp(v) if name in _LOG_NAMES else float(v) for name, v in named}
+    phase = "random" if chosen["leak_rate_hz"] > 0 else "rest"  # in the search: a leak carries pixels apart
     return replace(pixel, **chosen, initial_phase=phase)
 
 
@@ -361,3 +361,39 @@ def write_event_errors(
     statistics, truths = [one.statistic for one in solved], [one.truth for one in solved]
     errors = EventErrors.of([one.name for one in solved], statistics, prior, truths)
     return errors.write(setup, errors.gain_db(statistics, prior, truths))
+
+
+def went(name: str, residuals: Mapping[str, Residual]) -> str:
+    """Return in words what became of a residual."""
+    r = residuals[name]
+    return f"{name}: the residual went from {100 * r.before:.1f} % to {100 * r.after:.1f} %"
+
+
+def event_warnings(pixel: PixelFit, residuals: Mapping[str, Residual], worse: Collection[str]) -> list[str]:
+    """Return where the event pixel does not make what the camera recorded, a line each.
+
+    Args:
+        pixel: The fitted pixel.
+        residuals: What is left of captures held out, by name.
+        worse: Names of the ones that got worse.
+    """
+    if (counts := residuals.get(EVENT_RESIDUALS[0])) is None:
+        return []
+    found = []
+    if name := next((name for name in EVENT_RESIDUALS if name in worse), None):
+        found.append(
+            f"{went(name, residuals)}: the fitted event pixel is no nearer to this sensor than the usual one, "
+            "so do not rely on events; train with frames, or fine-tune on captures"
+        )
+    elif counts.after > _MOST_OF_COUNTS * counts.noise and counts.unexplained > _LEAST_OF_COUNTS:
+        found.append(
+            f"counts held out: {100 * counts.after:.0f} % is left where noise alone leaves "
+            f"{100 * counts.noise:.0f} %: this sensor is not of the event model's kind, so do not rely on a "
+            "network that has seen simulated events alone; train with frames, or fine-tune on captures"
+        )
+    if pixel.on_edge:
+        found.append(
+            f"pixel.{', pixel.'.join(pixel.on_edge)}: ended on the edge of what was tried, so the event "
+            "pixel is not known; the sensor may be of another kind"
+        )
+    return found

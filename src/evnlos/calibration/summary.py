@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from evnlos.calibration.event_fit import EVENT_RESIDUALS, event_warnings, went
 from evnlos.calibration.fit import SetupFit
 from evnlos.calibration.transport_fit import Residual, values_of
 from evnlos.calibration.wall_search import WALL_FILE
@@ -30,13 +31,9 @@ TARGETS = "targets"
 """Folder, beside the setup's file, of the known targets' images."""
 
 _SOME_OF_COUNTS = 1.1  # times what noise leaves of counts held out: from there on less comes of events
-_MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
 _GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
 _LEAST_GAIN_DB = 1.0  # of the best linear image over the mean target: matte walls have 0.5 to 0.8
 _DOUBTED = 100.0  # times the noise's variance: the light path misses what the frames would tell
-
-EVENT_RESIDUALS = ("counts held out", "surfaces held out")
-"""Residuals that the event pixel decides; where they got worse the light path still stands."""
 
 _UNTOLD = "not told by unknown targets: arbitrary"
 _ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
@@ -165,7 +162,11 @@ def residual_table(fit: SetupFit) -> str:
 
 
 def steps_table(fit: SetupFit) -> str:
-    """Return how much each step of the fit of a wall explains, as a text table; empty for other setups."""
+    """Return how much each step of the fit of a wall explains, as a text table; empty for other setups.
+
+    Args:
+        fit: The calibration.
+    """
     if not (steps := _steps(fit)):
         return ""
     cells = [["step of the wall's fit, % of what was left beside the noise", "taken away", ""]]
@@ -216,17 +217,16 @@ def _little_shown(fit: SetupFit) -> str:
     )
 
 
+def is_of_no_use(fit: SetupFit) -> bool:
+    """Return whether captures held out got worse, or the wall shows hardly anything: more than a warning."""
+    return bool(fit.worse or _little_shown(fit))
+
+
 def _to_train_on(fit: SetupFit) -> Simulation:
     """Return the simulation for training: what makes nothing like the recordings is drawn from wide ranges."""
     if fit.unexplained is None and not _event_warnings(fit):
         return fit.training
     return randomized(fit.training, walls=fit.unexplained is not None)
-
-
-def _went(fit: SetupFit, name: str) -> str:
-    """Return in words what became of a residual."""
-    r = fit.residuals[name]
-    return f"{name}: the residual went from {100 * r.before:.1f} % to {100 * r.after:.1f} %"
 
 
 def _other_kind(fit: SetupFit) -> str:
@@ -237,28 +237,7 @@ def _other_kind(fit: SetupFit) -> str:
 
 
 def _event_warnings(fit: SetupFit) -> list[str]:
-    """Return where the event pixel does not make what the camera recorded."""
-    counts = fit.residuals.get("counts held out")
-    if fit.pixel is None or counts is None:
-        return []
-    found = []
-    if worse := [name for name in fit.worse if name in EVENT_RESIDUALS]:
-        found.append(
-            f"{_went(fit, worse[0])}: the fitted event pixel is no nearer to this sensor than the usual one, "
-            "so do not rely on events; train with frames, or fine-tune on captures"
-        )
-    elif counts.after > _MOST_OF_COUNTS * counts.noise and counts.unexplained > _LEAST_OF_COUNTS:
-        found.append(
-            f"counts held out: {100 * counts.after:.0f} % is left where noise alone leaves "
-            f"{100 * counts.noise:.0f} %: this sensor is not of the event model's kind, so do not rely on a "
-            "network that has seen simulated events alone; train with frames, or fine-tune on captures"
-        )
-    if fit.pixel.on_edge:
-        found.append(
-            f"pixel.{', pixel.'.join(fit.pixel.on_edge)}: ended on the edge of what was tried, so the event "
-            "pixel is not known; the sensor may be of another kind"
-        )
-    return found
+    return [] if fit.pixel is None else event_warnings(fit.pixel, fit.residuals, fit.worse)
 
 
 def expectation(fit: SetupFit) -> str:
@@ -378,8 +357,8 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
     )
     if (of_frames := [name for name in fit.worse if name not in EVENT_RESIDUALS]) and not force:
         raise DataError(
-            f"{_went(fit, of_frames[0])}, so it is no fit of the setup and no setup file was written; check "
-            "that all captures show one unmoved setup, or try another --preset or start"
+            f"{went(of_frames[0], fit.residuals)}, so it is no fit of the setup and no setup file was written; "
+            "check that all captures show one unmoved setup, or try another --preset or start"
         )
     if fit.targets == "unknown" and fit.unexplained is not None and not force:
         raise DataError(

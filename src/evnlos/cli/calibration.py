@@ -85,12 +85,13 @@ class CalibrateCommand:
             fit_setup,
             residual_table,
             rows_of,
+            steps_table,
             table,
             warnings_of,
             write_event_errors,
             write_setup,
         )
-        from evnlos.calibration.summary import check_out, expectation, steps_table
+        from evnlos.calibration.summary import check_out, expectation, is_of_no_use
         from evnlos.data import captures_in
         from evnlos.plot.results import draw_calibration
         from evnlos.setups import TRAINING_FILE
@@ -108,7 +109,7 @@ class CalibrateCommand:
             print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
             print("\n\n".join(filter(None, (table(rows), residual_table(fit), steps_table(fit)))))
         drawn(self.out / "check.png", lambda: draw_calibration(fit, self.out / "check.png"))
-        for line in (warned := warnings_of(fit)):
+        for line in warnings_of(fit):
             say(f"warning: {line}")
         path = write_setup(fit, rows, self.out, self.force)
         if fit.pixel is not None and fit.known:
@@ -120,7 +121,7 @@ class CalibrateCommand:
             )
             print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")
             print(expectation(fit))
-        if (warned or fit.worse) and not self.force:
+        if is_of_no_use(fit) and not self.force:
             raise SystemExit(1)
 
 
