@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.config import from_dict
+from evnlos.config import config_hash, from_dict, to_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Step
@@ -19,6 +19,7 @@ from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.training import (
     MOST_ASYMMETRY,
     Training,
+    alternatives,
     asymmetry,
     augmented,
     between,
@@ -60,6 +61,40 @@ def test_what_harms_is_left(tiny_dataset, pretrained, tmp_path) -> None:
     assert choice is not None and choice.candidate is None and choice.table[0][-1] < -0.5
     ours, theirs = (load_weights(path).network.state_dict() for path in (run.folder, better))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
+def test_rate_epochs_normalization_embedding_and_what_is_kept_are_tried(
+    tiny_dataset, pretrained, tmp_path
+) -> None:
+    """Also for a network whose size is not that of the settings."""
+    asked = Training(epochs=1, learning_rate=1e-3)
+    tried = alternatives(asked, load_weights(pretrained).network)
+    assert tried[0] == asked and len({config_hash(to_dict(one)) for one in tried}) == 7
+    assert [one.freeze for one in tried if one.freeze] == [("encoder",)]
+    run = choose_and_finetune(tiny_dataset, tried, tmp_path / "run", pretrained)
+    choice = read_choice(run.folder)
+    assert choice is not None and len(choice.table) == 7 and choice.gain_db > 0
+    held = np.array(choice.table)
+    assert (held[:5, 0] == held[6, 0]).all() and held[5, 0] != held[6, 0]  # another embedding is another start
+
+
+def test_settings_that_the_captures_are_too_few_for_are_left_out(
+    tiny_dataset, pretrained, tmp_path, monkeypatch
+) -> None:
+    def picky(dataset: Dataset, settings: Training, *others):
+        if settings.refit_embedding:
+            raise DataError("2 objects to tell light from noise; give 8 or more")
+        return train(dataset, settings, *others)
+
+    monkeypatch.setattr("evnlos.training.choice.train", picky)
+    settings = Training(epochs=1, network=SMALL)
+    asks = replace(settings, refit_embedding=True)
+    choice = read_choice(
+        choose_and_finetune(tiny_dataset, (settings, asks), tmp_path / "run", pretrained).folder
+    )
+    assert choice is not None and set(choice.table[1]) == {None} and None not in choice.table[0]
+    with pytest.raises(DataError, match="give 8 or more"):  # asked for first, it is no alternative
+        choose_and_finetune(tiny_dataset, (asks, settings), tmp_path / "first", pretrained)
 
 
 def test_it_goes_on_and_repeats_its_bytes(tiny_dataset, pretrained, tmp_path) -> None:

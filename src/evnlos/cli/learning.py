@@ -153,8 +153,9 @@ class FinetuneCommand:
     config: Path | None = None
     """YAML file with settings."""
     choose: bool = False
-    """Try these settings, a fifth and five times the learning rate, keeping the normalization and not, on two
-    halves of the training captures in turn; take the best, part of the way to it, or nothing."""
+    """Try these settings, a fifth and five times the learning rate, keeping the normalization and not, three
+    times the epochs, the embedding fitted again and the first part of the network kept, on two halves of the
+    training captures in turn; take the best, part of the way to it, or nothing."""
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Training] = field(default_factory=finetuning)
@@ -168,7 +169,7 @@ class FinetuneCommand:
             return
         if known is not None:
             raise ConfigError("--choose tells by captures held out of --data; leave --captures away")
-        candidates = alternatives(self.settings)
+        candidates = alternatives(self.settings, load_weights(self.weights).network)
         with ProgressBars() as progress:
             trained = choose_and_finetune(dataset, candidates, self.out, self.weights, progress=progress)
         choice = read_choice(self.out)

@@ -47,14 +47,15 @@ class Choice:
         share: Share of the way from the old to the fine-tuned weights, 0..1.
         gain_db: Mean gain over the old weights on objects held out, dB.
         error_db: Standard error of that gain over the objects, dB.
-        table: Mean gain, dB, of every candidate [C] at every share [S]; the old weights have 0.
+        table: Mean gain, dB, of every candidate [C] at every share [S]; the old weights have 0. None: the
+            captures are too few for these settings.
     """
 
     candidate: int | None
     share: float
     gain_db: float
     error_db: float
-    table: list[list[float]]
+    table: list[list[float | None]]
 
     def sentence(self) -> str:
         """Return the choice in one sentence."""
@@ -66,16 +67,31 @@ class Choice:
         )
 
 
-def alternatives(settings: Training) -> tuple[Training, ...]:
-    """Return fine-tunings around one: itself, slower and quicker ones, with the normalization kept or not.
+def alternatives(settings: Training, network: Reconstructor) -> tuple[Training, ...]:
+    """Return fine-tunings around one: itself and others in which one thing is different.
+
+    A fifth of the learning rate, with the normalization of the weights; five times the rate, with that of the
+    captures; the normalization that is kept or not; three times the epochs; normalization and linear embedding
+    fitted again to the captures; the first part of the network as it is.
 
     Args:
         settings: The fine-tuning to vary.
+        network: What is fine-tuned.
     """
     rate, keeps = settings.learning_rate, settings.keep_normalization
-    slower = replace(settings, learning_rate=rate / 5, keep_normalization=True)
-    quicker = replace(settings, learning_rate=rate * 5, keep_normalization=False)
-    return (settings, slower, quicker, replace(settings, keep_normalization=not keeps))
+    found = [
+        settings,
+        replace(settings, learning_rate=rate / 5, keep_normalization=True),
+        replace(settings, learning_rate=rate * 5, keep_normalization=False),
+        replace(settings, keep_normalization=not keeps),
+        replace(settings, epochs=3 * settings.epochs),
+    ]
+    if not settings.refit_embedding:
+        again = {"refit_embedding": True, "network": network.settings}
+        found.append(replace(settings, **again, keep_normalization=False))
+    if network.parts and not settings.freeze:
+        found.append(replace(settings, freeze=tuple(network.parts)[:1]))
+    return tuple(found)
 
 
 def choose_and_finetune(
@@ -95,7 +111,8 @@ def choose_and_finetune(
 
     Args:
         dataset: Captures; the split `train` is dealt into folds and learned from, no other is read.
-        candidates: Settings of fine-tunings, one or more.
+        candidates: Settings of fine-tunings, one or more; any but the first may ask for more captures than
+            there are, and is then left out.
         out: Folder of the run, as of `train`, with `choice.json` beside the weights.
         weights: Weights or run to start from.
         folds: Parts of the training objects, 2 or more; with fewer objects than 2 nothing is fine-tuned.
@@ -209,7 +226,13 @@ def _cross_validated(
         for k, settings in enumerate(candidates):
             progress(Step(f"choose {trials.name}", j * len(candidates) + k, total, "trainings"))
             few = replace(dataset, split={"train": rest})
-            tuned = train(few, settings, trials / f"{k}-{j}", weights).load().network
+            try:
+                tuned = train(few, settings, trials / f"{k}-{j}", weights).load().network
+            except DataError:  # too few captures for these settings, as for an embedding fitted to them alone
+                if k == 0:
+                    raise
+                gains[k, :, part] = -math.inf
+                continue
             for s, share in enumerate(SHARES):
                 gains[k, s, part] = (
                     _scores(between(start.network, tuned, share), scored, dataset, held) - before
@@ -234,7 +257,7 @@ def _choice(gains: NDArray[np.float64]) -> Choice:
     k, s = np.unravel_index(int(mean.argmax()), mean.shape)
     count = gains.shape[2]
     error = float(gains[k, s].std(ddof=1) / np.sqrt(count)) if count > 1 else float("inf")
-    table = np.round(mean, 3).tolist()
+    table = [[round(gain, 3) if math.isfinite(gain) else None for gain in row] for row in mean.tolist()]
     if not mean[k, s] > error:
         return Choice(None, 0.0, 0.0, 0.0, table)
     return Choice(int(k), SHARES[s], round(float(mean[k, s]), 3), round(error, 3), table)
