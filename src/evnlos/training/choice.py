@@ -47,8 +47,7 @@ class Choice:
         share: Share of the way from the old to the fine-tuned weights, 0..1.
         gain_db: Mean gain over the old weights on objects held out, dB.
         error_db: Standard error of that gain over the objects, dB.
-        table: Mean gain, dB, of every candidate [C] at every share [S]; the old weights have 0. None: the
-            captures are too few for these settings.
+        table: Mean gain, dB, of every candidate [C] at every share [S]; None: the captures are too few for it.
     """
 
     candidate: int | None
@@ -68,11 +67,10 @@ class Choice:
 
 
 def alternatives(settings: Training, network: Reconstructor) -> tuple[Training, ...]:
-    """Return fine-tunings around one: itself and others in which one thing is different.
+    """Return fine-tunings around one: itself, then others.
 
-    A fifth of the learning rate, with the normalization of the weights; five times the rate, with that of the
-    captures; the normalization that is kept or not; three times the epochs; normalization and linear embedding
-    fitted again to the captures; the first part of the network as it is.
+    Slower, with the weights' normalization; quicker, with the captures'; that alone; more epochs; normalization
+    and linear embedding fitted again to the captures; the first part of the network kept.
 
     Args:
         settings: The fine-tuning to vary.
@@ -87,8 +85,8 @@ def alternatives(settings: Training, network: Reconstructor) -> tuple[Training, 
         replace(settings, epochs=3 * settings.epochs),
     ]
     if not settings.refit_embedding:
-        again = {"refit_embedding": True, "network": network.settings}
-        found.append(replace(settings, **again, keep_normalization=False))
+        again = replace(settings, refit_embedding=True, network=network.settings)
+        found.append(replace(again, keep_normalization=False))
     if network.parts and not settings.freeze:
         found.append(replace(settings, freeze=tuple(network.parts)[:1]))
     return tuple(found)
@@ -111,8 +109,7 @@ def choose_and_finetune(
 
     Args:
         dataset: Captures; the split `train` is dealt into folds and learned from, no other is read.
-        candidates: Settings of fine-tunings, one or more; any but the first may ask for more captures than
-            there are, and is then left out.
+        candidates: One or more; any but the first is left out where the captures are too few for it.
         out: Folder of the run, as of `train`, with `choice.json` beside the weights.
         weights: Weights or run to start from.
         folds: Parts of the training objects, 2 or more; with fewer objects than 2 nothing is fine-tuned.
@@ -134,7 +131,8 @@ def choose_and_finetune(
     about |= {"candidates": [to_dict(settings) for settings in candidates], "folds": folds}
     with directory_lock(out, check=lambda: check_run(out, about)):
         if (out / "weights.safetensors").is_file():
-            return TrainingResult(out, _records(out))
+            log = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+            return TrainingResult(out, log)
         save_yaml(about, out / "run.yaml")
         start.network.sampling = start.sampling.corrected_as(dataset.sampling)
         gains = _cross_validated(dataset, candidates, trials, weights, start, folds, progress)
@@ -217,14 +215,14 @@ def _cross_validated(
     gains = np.zeros((len(candidates), len(SHARES), len(objects)))
     if len(parts) < 2:
         return gains
-    total = len(candidates) * len(parts)
+    total, what = len(candidates) * len(parts), f"choose {trials.name}"
     for j, part in enumerate(parts):
         held = [objects[i] for i in part]
         rest = [name for name in objects if name not in held]
         scored = NlosDataset(replace(dataset, split={"train": held}), "train", start.modality)
         before = _scores(start.network, scored, dataset, held)
         for k, settings in enumerate(candidates):
-            progress(Step(f"choose {trials.name}", j * len(candidates) + k, total, "trainings"))
+            progress(Step(what, j * len(candidates) + k, total, "trainings"))
             few = replace(dataset, split={"train": rest})
             try:
                 tuned = train(few, settings, trials / f"{k}-{j}", weights).load().network
@@ -234,10 +232,9 @@ def _cross_validated(
                 gains[k, :, part] = -math.inf
                 continue
             for s, share in enumerate(SHARES):
-                gains[k, s, part] = (
-                    _scores(between(start.network, tuned, share), scored, dataset, held) - before
-                )
-    progress(Step(f"choose {trials.name}", total, total, "trainings"))
+                after = _scores(between(start.network, tuned, share), scored, dataset, held)
+                gains[k, s, part] = after - before
+    progress(Step(what, total, total, "trainings"))
     return gains
 
 
@@ -253,18 +250,13 @@ def _scores(
 
 def _choice(gains: NDArray[np.float64]) -> Choice:
     """Return the best of the gains [candidate, share, object], if it is more than its standard error."""
-    mean = gains.mean(axis=2)
+    mean, count = gains.mean(axis=2), gains.shape[2]
     k, s = np.unravel_index(int(mean.argmax()), mean.shape)
-    count = gains.shape[2]
     error = float(gains[k, s].std(ddof=1) / np.sqrt(count)) if count > 1 else float("inf")
     table = [[round(gain, 3) if math.isfinite(gain) else None for gain in row] for row in mean.tolist()]
     if not mean[k, s] > error:
         return Choice(None, 0.0, 0.0, 0.0, table)
     return Choice(int(k), SHARES[s], round(float(mean[k, s]), 3), round(error, 3), table)
-
-
-def _records(out: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
 
 
 MOST_ASYMMETRY = 1.05
@@ -353,8 +345,7 @@ def augmented(dataset: Dataset, modality: str, progress: Progress = silent) -> D
     return new
 
 
-_ASYMMETRIES: dict[Path, float] = {}
-"""Of the datasets that were looked at; several networks ask for one."""
+_ASYMMETRIES: dict[Path, float] = {}  # of the datasets that were looked at; several networks ask for one
 
 
 def _measured(folder: Path, progress: Progress) -> float:
