@@ -25,8 +25,7 @@ def wall_video() -> tuple[torch.Tensor, np.ndarray]:
 
 def count(light: torch.Tensor, times_s: np.ndarray, edges_s: np.ndarray) -> torch.Tensor:
     """Return what a real recording gives: hard counts [bins, 2, H, W], channel 0 ON."""
-    noiseless = {"threshold_sigma": 0.0, "leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0}
-    pixel = EventPixel(**TRUE, **noiseless, initial_phase="rest")
+    pixel = EventPixel(**TRUE, threshold_sigma=0, leak_rate_hz=0, shot_noise_rate_hz=0, initial_phase="rest")
     events = simulate_events(light, times_s, pixel)
     counts = np.zeros((BINS, 2, *light.shape[1:]))
     bins = np.searchsorted(edges_s, events.t_us * 1e-6, side="left") - 1
