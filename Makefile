@@ -5,18 +5,16 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 CAPTURES ?=
 DEMO ?= demo
+OPTIONS ?=
 
-.PHONY: demo test coverage thorough check site declared bench dist clean
+.PHONY: demo test thorough check site declared bench dist clean
 
 demo: $(READY)
 	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
 
+# OPTIONS=--coverage: also how many of the package's statements ran; kernels and started programs are not counted.
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -q
-
-# The same, with how many of the package's statements the tests run; kernels and started programs are not counted.
-coverage: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -q --coverage
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q $(OPTIONS)
 
 # With the tests that take long and repeat at another instant or format what a quicker one tests.
 thorough: $(READY)
