@@ -96,7 +96,7 @@ def main() -> None:
             spent[name].append(time.process_time() - start)
     unit = 1e9 / (HEIGHT * WIDTH * STEPS)
     base = statistics.median(spent["continuous, v2e's logarithm"])
-    lines = ["# Cost of the event models", "", *(__doc__ or "").split("\n\n")[2:], f"{machine('numba')}", ""]
+    lines = ["# Cost of the event models", "", *(__doc__ or "").split("\n\n")[2:], f"{machine()}", ""]
     lines += [
         "| model | ns per pixel and step | times today's continuous pixel | events |",
         "|---|---|---|---|",
