@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# One folder of captures, or a pattern of names: it may hold spaces.
 CAPTURES ?=
 DEMO ?= demo
 OPTIONS ?=
@@ -10,7 +11,7 @@ OPTIONS ?=
 .PHONY: demo test thorough check site declared bench dist clean
 
 demo: $(READY)
-	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
+	$(BIN)/evnlos demo --out "$(DEMO)" $(if $(strip $(CAPTURES)),--captures "$(CAPTURES)")
 
 # OPTIONS=--coverage: also how many of the package's statements ran; kernels and started programs are not counted.
 test: $(READY)
@@ -32,7 +33,7 @@ site: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 bench: $(READY)
-	for question in benchmarks/*.py; do $(BIN)/python $$question || exit 1; done
+	for question in benchmarks/*.py; do $(BIN)/python "$$question" || exit 1; done
 
 # Sdist and wheel of the package, the wheel below 10 MB and without weights, and the wheel of the weights.
 dist: $(READY)
@@ -44,12 +45,12 @@ declared: $(READY)
 	build/declared/venv/bin/python -I tests/declared.py
 
 clean:
-	rm -rf $(DEMO) build dist packages/*/build src/*.egg-info packages/*/src/*.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf "$(DEMO)" build dist packages/*/build src/*.egg-info packages/*/src/*.egg-info .pytest_cache .ruff_cache .hypothesis
 	find src tests benchmarks examples tools -name __pycache__ -prune -exec rm -rf {} +
 
 # PyTorch first: its CPU build where the package index has one, else whatever build the index gives.
 $(READY): pyproject.toml packages/evnlos-weights/pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0+cpu" \
 	  || $(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[all,dev,docs]" -e packages/evnlos-weights

@@ -3,6 +3,9 @@
 import contextlib
 import io
 import re
+import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -71,3 +74,12 @@ def test_make_targets_named_in_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
     for target in set(re.findall(r"(?:^ +|`)make (\w+)", TEXT, flags=re.MULTILINE)):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
+def test_captures_and_results_of_the_demo_may_have_spaces_in_their_names() -> None:
+    """`make demo CAPTURES="my shots/a"` handed over two words, `my` and `shots/a`."""
+    call = ["make", "-n", "-o", ".venv/.ready", "demo", "CAPTURES=my shots/*", "DEMO=my demo"]
+    said = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    words = shlex.split(next(line for line in said if "evnlos demo" in line))
+    assert words[1:] == ["demo", "--out", "my demo", "--captures", "my shots/*"]
