@@ -310,6 +310,7 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
     assert "--port is 'abc'; give a whole number; see" in fails(capsys, "app", "--port", "abc")
     assert "--fps is 'x'; give NUMBER; see" in fails(capsys, "events", "v.mp4", "--fps", "x", "--out", "e.h5")
     assert "--changing is '1'; give NUMBER NUMBER; see" in fails(capsys, "invert", "c", "--changing", "1")
+    assert "--pressset, near; perhaps you meant --set; see" in fails(capsys, "lab", "--pressset", "near")
     assert "Unrecognized options: --prot, 3; Perhaps you meant: --port INT" in fails(
         capsys, "app", "--prot", "3"
     )
@@ -361,7 +362,6 @@ def test_what_is_wrong_is_told_before_the_work(tiny_captures, tmp_path, capsys, 
     for words in (["identify", "main-near"], ["demo"], ["pixel", "fit", one], ["calibrate", one], ["simulate"]):
         assert "notes.txt is a file; give the name of a folder" in fails(capsys, *words, "--out", file)
     for words in (["track", one], ["invert", one, "--setup", "main-near"]):
-        assert "no such folder absent" in fails(capsys, *words, "--out", "absent/a.png")
         assert "end its name in .png" in fails(capsys, *words, "--out", "a.xyz")
         assert "is a folder; give the name of a file" in fails(capsys, *words, "--out", tmp_path)
     assert "Demo.writers is -1; give 1 or more" in fails(capsys, "demo", "--writers", -1)

@@ -201,14 +201,16 @@ def test_wrong_videos_and_settings_leave_nothing(tmp_path: Path, capsys, monkeyp
     refuses("no such file", "absent.mp4", "--out", "e.h5")
     refuses("text.mp4: not a video", "text.mp4", "--out", "e.h5")
     refuses("1 frame", "one.npy", "--fps", 30, "--out", "e.h5")
-    refuses("give fps (--fps)", "clip.npy", "--out", "e.h5")
+    refuses("give --fps", "clip.npy", "--out", "e.h5")
     refuses("--start 100 leaves 0 of the frames of a video that ends at", *good, "--start", 100)
     refuses("davis346", *good, "--pixel", "davis364")
     refuses("does not exist", *good, "--pixel", "absent.yaml")
     refuses("threshold_on", *good, "--pixel.threshold-on", 0)
-    refuses("suffix ''", "clip.npy", "--fps", 30, "--out", "events")
+    refuses("events: cannot write a name without suffix; end its", "clip.npy", "--fps", 30, "--out", "events")
+    refuses("or give --format, one of HDF5", "clip.npy", "--fps", 30, "--out", "events")
     refuses("suffix '.xyz'", "clip.npy", "--fps", 30, "--out", "e.xyz")
-    refuses("no such folder", "clip.npy", "--fps", 30, "--out", "absent/e.h5")
+    refuses("give --fps", "clip.npy", "--out", "absent/e.h5")
+    refuses("clip.npy is not an image; several files", "clip.npy", "text.mp4", "--fps", 30, "--out", "e.h5")
     refuses("--force", "clip.npy", "--fps", 30, "--out", "there.h5")
     refuses("scale", *good, "--scale", "large")
     refuses(".gif or .png", *good, "--preview", "look.jpg")
@@ -216,6 +218,17 @@ def test_wrong_videos_and_settings_leave_nothing(tmp_path: Path, capsys, monkeyp
     refuses("no video", "--out", "e.h5")
     call("events", *good[:-1], "there.h5", "--force")
     assert len(read_events("there.h5")) > 100
+    call("events", *good[:-1], "made/for/it.h5", "--preview", "and/look.png")
+    assert read_events("made/for/it.h5") == read_events("there.h5") and Path("and/look.png").is_file()
+
+
+def test_arrays_in_a_folder_are_videos(tmp_path: Path, capsys) -> None:
+    (tmp_path / "arrays").mkdir()
+    for name in ("a", "b"):
+        np.save(tmp_path / f"arrays/{name}.npy", np.stack(moving_bar()))
+    call("events", tmp_path / "arrays", "--fps", 30, "--out", tmp_path / "made/of/them")
+    first, second = (read_events(tmp_path / f"made/of/them/{name}.npy.h5") for name in ("a", "b"))
+    assert first == second and len(first) > 100
 
 
 # ---- info
@@ -274,9 +287,8 @@ def test_info_shows_damage_and_never_refuses_it(tmp_path: Path, capsys) -> None:
     call("info", tmp_path / "cut.raw")
     shown = capsys.readouterr().out
     assert "1 truncated" in shown and "39,999 in" in shown
-    assert "(evnlos convert --on-error salvage)" in fails(
-        capsys, "convert", tmp_path / "cut.raw", "--out", tmp_path / "cut.h5"
-    )
+    said = fails(capsys, "convert", tmp_path / "cut.raw", "--out", tmp_path / "cut.h5")
+    assert "or read it with evnlos convert --on-error salvage" in said and "on_error" not in said
     call("info", tmp_path / "cut.raw", "--json")
     assert json.loads(capsys.readouterr().out)["faults"] == {"truncated": 1}
     write_events(tmp_path / "none.h5", Events.empty(4, 3))
@@ -376,10 +388,10 @@ def test_wrong_conversions_leave_nothing(tmp_path: Path, capsys, monkeypatch) ->
     for match, *arguments in (
         ("--force", "a.h5", "--out", "there.npz"),
         ("the file that is read", "a.h5", "--out", "a.h5", "--force"),
-        ("suffix ''", "a.h5", "--out", "b"),
+        ("a name without suffix", "a.h5", "--out", "b"),
         ("format 'EVT9'", "a.h5", "--out", "b.raw", "--format", "EVT9"),
         ("no such file", "absent.h5", "--out", "b.h5"),
-        ("no such folder", "a.h5", "--out", "absent/b.h5"),
+        ("leaves the sensor", "a.h5", "--out", "absent/b.h5", "--box", 30, 0, 20, 10),
         ("unknown polarity", "a.h5", "--out", "b.raw"),
         ("leaves the sensor", "a.h5", "--out", "b.h5", "--box", 30, 0, 20, 10),
         ("sides >= 1", "a.h5", "--out", "b.h5", "--box", 0, 0, 0, 10),
@@ -442,7 +454,7 @@ def test_wrong_previews_leave_nothing(tmp_path: Path, capsys, monkeypatch) -> No
     before = left_in(tmp_path)
     for match, *arguments in (
         (".gif or .png", "a.h5", "--out", "a.jpg"),
-        ("no such folder", "a.h5", "--out", "absent/a.png"),
+        ("no events to show", "none.h5", "--out", "absent/a.png"),
         ("no such file", "absent.h5"),
         ("no events to show", "none.h5"),
         ("no events to show", "a.h5", "--start", 99),

@@ -118,7 +118,7 @@ def test_writing_is_atomic_and_says_what_is_wrong(tmp_path, monkeypatch):
     with pytest.raises(EventFileError, match="No space"):
         write_events(path, events)
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["e.npz"]
-    for wrong, said in (("a.xyz", "suffix"), ("missing/a.npz", "folder")):
+    for wrong, said in (("a.xyz", "suffix '.xyz'; end its name in one of .h5"), ("a", "a name without suffix")):
         with pytest.raises(EventFileError, match=said):
             write_events(tmp_path / wrong, events)
     with pytest.raises(EventFileError, match="format"):

@@ -60,7 +60,7 @@ def test_event_files_on_a_full_disk_are_one_line_and_nothing_is_left(tmp_path) -
     assert full.returncode == 0, full.stderr[-2000:]
     lines = full.stdout.splitlines()
     assert [line.split()[0] for line in lines] == ["a.h5", "a.aedat4", "a.npz", "a.csv", "a.raw", "a_100M.bin"]
-    assert all("writing failed" in line for line in lines), lines
+    assert all("writing failed" in line and "[Errno 27] File too large" in line for line in lines), lines
     assert full.stderr == ""
     assert list(tmp_path.iterdir()) == []
 
@@ -81,6 +81,24 @@ def test_a_file_that_is_not_on_the_disk_does_not_get_its_name(tmp_path, monkeypa
         (draft / "x").write_bytes(b"x")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_bytes() == b"before"
+
+
+def test_folders_above_a_file_are_made_and_go_again_where_it_fails(tmp_path) -> None:
+    write_atomically(tmp_path / "a/b/c.txt", b"whole")
+    assert (tmp_path / "a/b/c.txt").read_bytes() == b"whole"
+    with pytest.raises(ZeroDivisionError), new_file(tmp_path / "a/d/e/f") as temporary:
+        temporary.write_bytes(bytes(1 // 0))
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+
+
+def test_an_error_names_the_file_and_not_the_draft(tmp_path, monkeypatch) -> None:
+    def refused(self: Path, content: bytes) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "write_bytes", refused)
+    with pytest.raises(OSError) as caught:
+        write_atomically(tmp_path / "x.png", b"")
+    assert str(caught.value) == f"[Errno 13] Permission denied: {str(tmp_path / 'x.png')!r}"
 
 
 def test_an_error_in_the_middle_of_a_file_leaves_none(tmp_path) -> None:

@@ -26,6 +26,24 @@ def printable(text: object, *, lines: bool = False) -> str:
     return pattern.sub(lambda found: found[0].encode("unicode_escape").decode(), str(text))
 
 
+_OF_PYTHON = re.compile(r'(?:\b\w+=(?:"\w+"|\w+)?(?: and)? )+\(((?:--|evnlos )[^()]*)\)')
+
+
+def for_command_line(text: object) -> str:
+    """Return a message that names what to give in Python, and then a flag or a command, with the latter alone.
+
+    Args:
+        text: A message, or the error that it is of.
+
+    Example:
+        >>> for_command_line("its frames carry no times; give fps= (--fps)")
+        'its frames carry no times; give --fps'
+        >>> for_command_line('read it with on_error="salvage" (evnlos convert --on-error salvage)')
+        'read it with evnlos convert --on-error salvage'
+    """
+    return _OF_PYTHON.sub(r"\1", str(text))
+
+
 class EvnlosError(Exception):
     """Base of every error that bad input raises; its text is one line a user can act on."""
 

@@ -28,18 +28,16 @@ _swept: set[Path] = set()  # folders in which this process has looked for what d
 
 
 def write_atomically(path: str | PathLike[str], content: bytes) -> None:
-    """Write a file so that a reader sees either all of it or nothing: temporary file, fsync, rename.
+    """Write a file so that a reader sees either all of it or nothing; folders above it are made.
 
     Raises:
         DataError: The name is that of a folder, a device or a pipe.
         OSError: The content can't be written; no file is left.
     """
-    path = Path(path)
-    folder = path.parent.absolute()
-    if folder not in _swept:
+    if (folder := Path(path).parent.absolute()) not in _swept:
         _swept.add(folder)
         _sweep(folder)
-    with _in_place_of(path) as temporary:
+    with _in_place_of(Path(path)) as temporary:
         temporary.write_bytes(content)
 
 
@@ -47,8 +45,8 @@ def write_atomically(path: str | PathLike[str], content: bytes) -> None:
 def new_file(path: str | PathLike[str]) -> Iterator[Path]:
     """Give a temporary name beside `path` to write under; the file takes the name of `path` when all went well.
 
-    It is on the disk before it does. Leaving the block by an error leaves no file; what a process left that was
-    killed goes when a file is begun in the same folder.
+    It is on the disk before it does, in folders that are made. Leaving the block by an error leaves none; what
+    a process left that was killed goes when a file is begun in the same folder.
 
     Args:
         path: The file to write; an existing one is replaced.
@@ -84,8 +82,7 @@ def new_folder(path: str | PathLike[str]) -> Iterator[Path]:
         DataError: The folder holds something, or another process is at work in it.
         OSError: It can't be made.
     """
-    path = Path(path).absolute()
-    check_folder(path)
+    check_folder(path := Path(path).absolute())
     if path.is_dir():
         with _held(path, _busy(path)):
             yield from _filled(path)
@@ -132,10 +129,9 @@ def _filled(path: Path) -> Iterator[Path]:
 
 def is_empty(folder: str | Path) -> bool:
     """Return whether a folder holds nothing but locks and unfinished files, or is not there."""
-    folder = Path(folder)
-    return not folder.exists() or (
-        folder.is_dir() and all(_is_lock(path) or _UNFINISHED.fullmatch(path.name) for path in folder.iterdir())
-    )
+    if not (folder := Path(folder)).exists():
+        return True
+    return folder.is_dir() and all(_is_lock(one) or _UNFINISHED.fullmatch(one.name) for one in folder.iterdir())
 
 
 def _is_lock(path: Path) -> bool:
@@ -239,12 +235,19 @@ def _in_place_of(path: Path) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         raise DataError(f"{path} is no plain file but a folder, device or pipe; give the name of a file")
     temporary = path.with_name(_unfinished(path.name))
+    made = [folder for folder in path.parents if not folder.exists()]
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         _synchronise(temporary)
         temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename == str(temporary):
+            error.filename = str(path)  # the name that a user knows
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+            for folder in made:
+                folder.rmdir()
         raise
 
 
@@ -323,9 +326,8 @@ def published_list(address: str, kind: str) -> dict[str, str]:
     found = {match[2]: match[1] for match in map(_LINE.fullmatch, lines) if match}
     if not found or len(found) != len(lines) or len(text) > _MOST_LIST_BYTES:
         raise DataError(f"{address}: {kind}/{LIST} is no list of files; give an address of published files")
-    for name in found:
-        if ":" in name or not {"", ".", ".."}.isdisjoint(name.split("/")):
-            raise DataError(f"{address}: {kind}/{LIST} names {name[:80]!r}, outside its folder; don't use it")
+    if outside := [name for name in found if ":" in name or {"", ".", ".."} & {*name.split("/")}]:
+        raise DataError(f"{address}: {kind}/{LIST} names {outside[0][:80]!r}, outside its folder; don't use it")
     return dict(sorted(found.items()))
 
 
@@ -345,7 +347,6 @@ def fetch_file(address: str, kind: str, name: str, digest: str, out: Path, most_
         DataError: The file is another one, or too large.
     """
     size, found = 0, hashlib.sha256()
-    (out / name).parent.mkdir(parents=True, exist_ok=True)
     with (
         _opened(address, f"{kind}/{name}") as source,
         new_file(out / name) as draft,

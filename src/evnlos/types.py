@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 OutFolder = Path
 """Type of a command's `out`: a folder that it makes, with the folders above it, or goes on with."""
 OutFile = Path
-"""The same: a file in a folder that is there."""
+"""The same: a file."""
 OutImage = Path
 """The same: a file whose ending names a format of images."""
 

@@ -94,13 +94,13 @@ class Video:
             if self.fps is not None:
                 time_s = number / self.fps
             elif stated_s is None:
-                raise DataError(f"{self.path}: frame {number} carries no time; give fps (--fps)")
+                raise DataError(f"{self.path}: frame {number} carries no time; give fps= (--fps)")
             else:
                 first = stated_s if number == 0 else first
                 time_s = stated_s - first
             if time_s <= before:
                 found = f"frame {number} is at {time_s:.6f} s, the one before it at {before:.6f} s"
-                raise DataError(f"{self.path}: {found}; give fps (--fps) in place of the file's times")
+                raise DataError(f"{self.path}: {found}; give fps= (--fps) in place of the file's times")
             before = time_s
             if self.box is not None:
                 left, top, right, bottom = self.box
@@ -157,7 +157,7 @@ def open_video(
             f"{shown}: {source.frames} frame{'s' * (source.frames != 1)}; events need a video of at least two"
         )
     if fps is None and not source.timed:
-        raise DataError(f"{shown}: its frames carry no times; give fps (--fps)")
+        raise DataError(f"{shown}: its frames carry no times; give fps= (--fps)")
     chosen = white or source.white or _white_of_floats(shown, source)
     width, height = _working_size(scale, source.size)
     return Video(shown, width, height, source.frames, fps, slow_motion, tone, chosen, source, colour=colour)
@@ -295,6 +295,9 @@ def _named(paths: list[Path]) -> tuple[Path, PictureSource]:
     missing = [path for path in paths if not path.is_file()]
     if missing:
         raise DataError(no_file(missing[0]))
+    if other := next((path for path in paths if path.suffix.lower() not in _PICTURES), None):
+        cure = "several files are the images of one video: give one video, or a folder of videos"
+        raise DataError(f"{other} is not an image; {cure}")
     paths = sorted(
         paths, key=lambda path: [int(s) if s.isdigit() else s for s in re.split(r"(\d+)", str(path))]
     )

@@ -96,7 +96,7 @@ class PixelChanges:
         return replace(pixel, **changes)  # type: ignore[type-var]
 
 
-_VIDEO_ENDINGS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".gif")
+_VIDEO_ENDINGS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".gif", ".npy")
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class EventsCommand:
         tyro.conf.arg(metavar="VIDEO", help_behavior_hint="(required)"),
     ]
     """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, images or a folder of them, .npy [T, H, W(, 3)]; or a
-    folder of videos."""
+    folder of videos (files of FFmpeg's, GIF, .npy)."""
     out: Path
     """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv. Of a folder of
     videos a folder, with an .h5 file for each; those that are there already are kept."""
@@ -159,13 +159,11 @@ class EventsCommand:
                 if out.exists() and not self.force:
                     say(f"{out}: there already")
                     continue
-                self.out.mkdir(parents=True, exist_ok=True)
                 replace(self, video=(video,), out=out).run()
             return
         refuse_existing(self.force, self.out, *([self.preview] if self.preview else []))
         look = look_of(self.preview) if self.preview else None
         pixel = self.changes.applied(load_pixel(self.pixel))
-        writer = EventWriter(self.out, format=self.format)
         video = open_video(
             self.video,
             fps=self.fps,
@@ -179,6 +177,7 @@ class EventsCommand:
         on = instants = 0
         last_us = -1
         clock = _Clock(self.start, self.stop)
+        writer = EventWriter(self.out, format=self.format)
         with writer, ProgressBars() as progress:
             writer.write(Events.empty(video.width, video.height))
             watched = clock.watched(video, self.out.name, progress)

@@ -17,8 +17,8 @@ import torch
 import tyro
 from numpy.typing import NDArray
 
-from evnlos.cli.parsing import check_files, drawn, refuse_existing, say, tracks_text
-from evnlos.cli.recordings import Folders, Force
+from evnlos.cli.parsing import check_files, drawn, refuse_existing, say
+from evnlos.cli.recordings import Folders, Force, tracks_text
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars

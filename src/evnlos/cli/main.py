@@ -40,7 +40,7 @@ from evnlos.cli.parsing import (
     todays_words,
 )
 from evnlos.doctor import WORK_LIBRARIES, examine, fault_behind, without_work_libraries
-from evnlos.errors import ConfigError, EvnlosError, UnknownNameError, printable
+from evnlos.errors import ConfigError, EvnlosError, UnknownNameError, for_command_line, printable
 from evnlos.machine import PROGRESS, SHOWN, sleep_while_waiting
 from evnlos.registry import Kinded, __version__, kind_of
 
@@ -123,7 +123,7 @@ def main(argv: list[str] | None = None) -> None:
         if wishes:  # a library that was interrupted while it was imported says so in its own way
             _end(verb, wishes[-1])
         if isinstance(error, EvnlosError):
-            print(f"evnlos {verb}: error: {error}", file=sys.stderr)
+            print(f"evnlos {verb}: error: {for_command_line(error)}", file=sys.stderr)
             sys.exit(2)
         fault = fault_behind(error)
         if fault is not None:

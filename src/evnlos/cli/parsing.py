@@ -3,12 +3,12 @@
 - Notes on stderr: how much a command says beside its result (`--log-level`, EVNLOS_LOG).
 - From the words after a verb to its command; what does not fit is one line, not the parser's box.
 - What names on a command line stand for, before the libraries of the work are there.
-- The figures of several objects as lines.
 """
 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import glob
 import importlib
 import io
@@ -208,15 +208,21 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
     import tyro
 
     said = io.StringIO()
+    # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
+    config = (tyro.conf.AvoidSubcommands, tyro.conf.HelptextFromCommentsOff)
     try:
         with contextlib.redirect_stderr(said), _unwrapped(words):
-            # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
-            config = (tyro.conf.AvoidSubcommands, tyro.conf.HelptextFromCommentsOff)
             found = tyro.cli(command, args=words, prog=f"evnlos {verb}", default=default, config=config)
     except SystemExit as end:
         if not end.code:
             raise
-        raise UnfitWordsError(f"{_plain(in_one_line(said.getvalue()))}; see evnlos {verb} --help") from None
+        text = _plain(in_one_line(said.getvalue()))
+        if (unknown := re.search(r"Unrecognized options: (--[\w.-]+)", text)) and "Perhaps you meant" not in text:
+            with contextlib.redirect_stdout(io.StringIO()) as page, contextlib.suppress(SystemExit):
+                tyro.cli(command, args=["--help"], default=default, config=config)
+            flags = set(re.findall(r"--[\w.-]*\w", page.getvalue()))
+            text += "".join(f"; perhaps you meant {one}" for one in difflib.get_close_matches(unknown[1], flags, 1))
+        raise UnfitWordsError(f"{text}; see evnlos {verb} --help") from None
     except (ArithmeticError, MemoryError, ValueError) as error:  # of a setting that only fits together
         raise ConfigError(f"the settings do not fit together ({error}); see evnlos {verb} --help") from None
     from evnlos.config import check_numbers  # needs packages that may be missing
@@ -363,8 +369,6 @@ def check_out(path: Path, kind: str, force: bool = False, beside: Sequence[str] 
     _check_writable(path)
     if not kind.startswith(("OutFile", "OutImage")):
         return
-    if not path.parent.is_dir():
-        raise ConfigError(f"{path}: no such folder {path.parent}; create it first")
     if path.is_dir():
         raise ConfigError(f"{path} is a folder; give the name of a file")
     if kind.startswith("OutImage") and path.suffix.lower() not in _IMAGES:
@@ -381,20 +385,3 @@ def _check_writable(path: Path) -> None:
     is_fixed = hasattr(os, "statvfs") and os.statvfs(place).f_flag & os.ST_RDONLY  # which root's rights hide
     if is_fixed or not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)):
         raise ConfigError(f"{path} cannot be written: {place} is not writable; give another place")
-
-
-def tracks_text(told: dict[str, Any]) -> str:
-    """Return the figures of several objects as lines for people."""
-    from evnlos.types import length_text  # NumPy loads slowly
-
-    lines = [f"{told['capture']}: {told['targets']} moving object{'s' * (told['targets'] != 1)}"]
-    for k, gain in enumerate(told["evidence_gains"]):
-        error = " and the setup's own error" if k else ""
-        lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}{error}")
-    for k, row in enumerate(told["objects"]):
-        travel, speed, sigma = (length_text(row[name]) for name in ("travel", "mean_speed", "position_sigma"))
-        lines.append(f"object {k + 1}    travel {travel}, {speed}/s, position +- {sigma}")
-        if row["target"] is not None:
-            x, y, error = (length_text(one) for one in (*row["position_offset"], row["position_error"]))
-            lines[-1] += f"; {row['target']}: error {error} rms about ({x}, {y})"
-    return "\n".join([*lines, *told["pictures"]])

@@ -1,6 +1,6 @@
 """Commands on event files: `convert`, `info`, `preview`, and what commands share.
 
-- What all commands share: flat settings, presets, results as JSON.
+- What all commands share: flat settings, presets, results as JSON, figures of several objects.
 - What the commands on event files share: how a file is read, what is taken of it, numbers in words.
 - `evnlos convert`: an event file in, an event file of another format out.
 - `evnlos info`: what an event file holds, and what is wrong with it.
@@ -24,7 +24,7 @@ from evnlos.events.files.columns import OnError
 from evnlos.events.recording import WINDOW_US, Box, CropOptions, Recording, Summary, summarise
 from evnlos.machine import ProgressBars, Step
 from evnlos.plot.preview import Background, PreviewOptions, Style, preview_images
-from evnlos.types import Events, OutFile, matching_paths
+from evnlos.types import Events, OutFile, length_text, matching_paths
 
 T = TypeVar("T")
 _PATHS = tyro.constructors.PrimitiveConstructorSpec(
@@ -358,8 +358,6 @@ def look_of(
     """Return the look of a preview, checked against the ending of its file."""
     if out.suffix.lower() not in _FRAMES:
         raise ConfigError(f"{out}: a preview ends in {' or '.join(_FRAMES)}; give such a name")
-    if not out.parent.is_dir():
-        raise ConfigError(f"{out}: no such folder {out.parent}; create it first")
     return PreviewOptions(
         style, background, _FRAMES[out.suffix.lower()] if frames is None else frames, window_ms, side_px
     )
@@ -379,3 +377,18 @@ def write_preview(recording: Recording, cut: CropOptions, out: Path, look: Previ
     else:
         save_png(out, strip(pictures, _COLUMNS))
     return out.stat().st_size
+
+
+def tracks_text(told: dict[str, Any]) -> str:
+    """Return the figures of several objects as lines for people."""
+    lines = [f"{told['capture']}: {told['targets']} moving object{'s' * (told['targets'] != 1)}"]
+    for k, gain in enumerate(told["evidence_gains"]):
+        error = " and the setup's own error" if k else ""
+        lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}{error}")
+    for k, row in enumerate(told["objects"]):
+        travel, speed, sigma = (length_text(row[name]) for name in ("travel", "mean_speed", "position_sigma"))
+        lines.append(f"object {k + 1}    travel {travel}, {speed}/s, position +- {sigma}")
+        if row["target"] is not None:
+            x, y, error = (length_text(one) for one in (*row["position_offset"], row["position_error"]))
+            lines[-1] += f"; {row['target']}: error {error} rms about ({x}, {y})"
+    return "\n".join([*lines, *told["pictures"]])

@@ -387,7 +387,7 @@ class CsvSink(FileSink):
             part = events[start : start + (1 << 16)].columns().values()
             values = np.stack([column.astype(np.int64) for column in part], axis=1)  # [rows, columns]
             text = np.empty(21 * values.size, np.uint8)
-            text[: print_rows(values, text)].tofile(self.file)
+            self.file.write(text[: print_rows(values, text)].data)  # tofile says not why it failed
         self._events += len(events)
 
     def finish(self) -> None:

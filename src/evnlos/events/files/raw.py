@@ -342,7 +342,7 @@ class RawSink(FileSink):
         t_us = events.t_us - self._t0_us
         words = np.empty(self._encoder.size(t_us, self._last), self._encoder.dtype)
         count = self._encoder.encode(t_us, events.x, events.y, events.p, self._high, words)
-        words[:count].tofile(self.file)
+        self.file.write(words[:count].data)
         self._last = int(t_us[-1])
         self._high = self._last // self._encoder.high_us
         self._events += len(events)

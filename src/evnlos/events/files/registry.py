@@ -235,14 +235,15 @@ def format_to_write(path: Path, name: str | None) -> Format:
     writable = [format for format in FORMATS if format.create]
     if name is None:
         found = [format for format in writable if path.suffix.lower() in format.suffixes]
-        what = f"suffix {path.suffix!r}"
+        what = f"suffix {path.suffix!r}" if path.suffix else "a name without suffix"
     else:
         found = [format for format in writable if format.name == name.upper()]
         what = f"format {name!r}"
     if not found:
         suffixes = dict.fromkeys(suffix for format in writable for suffix in format.suffixes)
         names = ", ".join(format.name for format in writable)
-        raise EventFileError(f"{path}: cannot write {what}; suffixes {', '.join(suffixes)}, formats {names}")
+        cure = f"end its name in one of {', '.join(suffixes)}, or give format= (--format), one of {names}"
+        raise EventFileError(f"{path}: cannot write {what}; {cure}")
     return found[0]
 
 
@@ -277,8 +278,6 @@ class EventWriter:
     def __init__(self, path: str | PathLike[str], *, format: str | None = None) -> None:
         self.path = Path(path)
         self._format = format_to_write(self.path, format)
-        if not self.path.parent.is_dir():
-            raise EventFileError(f"{self.path}: no such folder {self.path.parent}; create it first")
         self._place = new_file(self.path)
         self._temporary = self._place.__enter__()
         self._sink: Sink | None = None
