@@ -214,7 +214,11 @@ def test_a_sharp_setup_shows_more_than_a_matte_wall():
     assert averaged.at_camera.patterns > easy.at_camera.patterns
     assert averaged.at_camera.finest_m < easy.at_camera.finest_m
     json.dumps(easy.summary(arrays=True))
-    assert setup_table([easy, matte]).count("\n| ") == 2
+    table = setup_table([easy, matte]).splitlines()
+    assert table[0].startswith("From one frame; two figures") and "|" not in "".join(table)
+    assert len({line.index(line.split("  ")[-1]) for line in table[1:4]}) == 1  # the last column is one
+    assert easy.verdict.startswith("From one frame of this wall ")
+    assert averaged.verdict.startswith("From the mean of 100 frames of this wall ")
 
 
 def test_a_post_resolves_across_itself_only():
@@ -265,7 +269,7 @@ def test_command(tmp_path, capsys):
     assert "training data" in found["verdict"]
     main(["identify", "matte-near", "hard-far", "--out", str(tmp_path / "o"), *small])
     shown = capsys.readouterr().out
-    assert "| matte-near | 3 |" in shown and "hard-far: With this wall" in shown
+    assert "\nmatte-near  3  " in shown and "hard-far: From one frame of this wall" in shown and "--bounds" in shown
     names = {path.name for path in (tmp_path / "o").iterdir()}
     assert names == {"identify_matte-near.png", "identify_hard-far.png", "identify_setups.png", "identify.json"}
     assert len(json.loads((tmp_path / "o" / "identify.json").read_text())) == 2

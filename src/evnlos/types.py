@@ -308,16 +308,14 @@ class Plane:
     @property
     def x_m(self) -> NDArray[np.float64]:
         """Horizontal coordinate of each column's centre, float64 [W], metres."""
-        return (
-            self.center_m[0] + (np.arange(self.width, dtype=np.float64) - (self.width - 1) / 2) * self.pitch_m
-        )
+        columns = np.arange(self.width, dtype=np.float64) - (self.width - 1) / 2
+        return self.center_m[0] + columns * self.pitch_m
 
     @property
     def y_m(self) -> NDArray[np.float64]:
         """Vertical coordinate (downwards) of each row's centre, float64 [H], metres."""
-        return (
-            self.center_m[1] + (np.arange(self.height, dtype=np.float64) - (self.height - 1) / 2) * self.pitch_m
-        )
+        rows = np.arange(self.height, dtype=np.float64) - (self.height - 1) / 2
+        return self.center_m[1] + rows * self.pitch_m
 
 
 _USUAL_SIDE_M = 0.08
@@ -346,6 +344,12 @@ def length_text(length: float, unit: str = "m", digits: int = 2) -> str:
     if unit == "m":
         return f"{length:.{digits + 1}f} m" if abs(length) >= 0.9999 else f"{1e3 * length:.{digits}f} mm"
     return f"{length:.{digits}f} {unit}"
+
+
+def aligned(cells: list[list[str]]) -> str:
+    """Return the rows of a table as text whose columns, all of the first row's, stand below each other."""
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in cells)
 
 
 def matching_paths(given: Iterable[str | Path]) -> list[Path]:

@@ -22,7 +22,7 @@ from evnlos.analysis.linearized import (
 )
 from evnlos.machine import note
 from evnlos.setups import Setup
-from evnlos.types import derive_seed
+from evnlos.types import aligned, derive_seed
 
 if TYPE_CHECKING:
     from evnlos.inverse.prior import TargetPrior
@@ -33,7 +33,11 @@ _EXTRA_MODES = 1.1
 
 
 def verdict(
-    patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, target_size_m: float
+    patterns: int,
+    finest_m: tuple[float | None, float | None],
+    stroke_m: float,
+    target_size_m: float,
+    frames: int = 1,
 ) -> str:
     """Return in a sentence what a reconstruction with this setup would be.
 
@@ -45,6 +49,7 @@ def verdict(
         finest_m: Width of the finest upright and lying bars that are resolved, metres; None where none are.
         stroke_m: Typical stroke of the targets, metres.
         target_size_m: Side of the target plane, metres.
+        frames: How many frames of a target at rest are averaged.
 
     Example:
         >>> verdict(3, (None, None), 0.008, 0.08).split(": ")[1]
@@ -67,7 +72,7 @@ def verdict(
         meaning = f"the rough shape is measured, {fine}: their detail would come from the training data"
     else:
         meaning = "a legible reconstruction would come from the training data, not from the measurement"
-    return f"With this wall and noise {patterns} patterns can be distinguished, and {bars}: {meaning}."
+    return f"From {_frames(frames)} of this wall {patterns} patterns can be distinguished, and {bars}: {meaning}."
 
 
 def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float) -> str | None:
@@ -164,7 +169,7 @@ class Identification:
     @property
     def wall(self) -> str:
         """What the wall allows, in one sentence that does not hang on the grid of the analysis."""
-        return f"from one frame of this wall, {self.verdict.partition(': ')[2].removesuffix('.')}"
+        return f"from {_frames(self.settings.frames)} of this wall, {self.verdict.partition(': ')[2].removesuffix('.')}"
 
     def summary(self, arrays: bool = False) -> dict[str, Any]:
         """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
@@ -180,12 +185,13 @@ class Identification:
             "settings": asdict(self.setup),
         }
         for name, one in (("camera_noise", self.at_camera), ("noise_std", self.at_noise_std)):
+            upright, lying = (None if width is None else round(width, 5) for width in one.stroke_m)
             found[name] = {
                 "rms_noise": round(one.noise, 6),
                 "patterns_above_noise": one.patterns,
                 "psnr_linear_db": round(one.psnr_db, 2),
-                "finest_upright_stroke_m": _rounded(one.stroke_m[0]),
-                "finest_lying_stroke_m": _rounded(one.stroke_m[1]),
+                "finest_upright_stroke_m": upright,
+                "finest_lying_stroke_m": lying,
             }
             if arrays:
                 found[name]["singular_values_over_noise"] = one.spectrum.tolist()
@@ -259,7 +265,7 @@ def identify(
         targets.test[targets.typical].reshape(settings.target_plane.shape),
         at_camera,
         at_noise_std,
-        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, settings.target_size_m),
+        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, settings.target_size_m, settings.frames),
         tuple(warnings),
     )
 
@@ -364,36 +370,29 @@ def _psnr(error: torch.Tensor) -> float:
     return float((-10 * torch.log10(error)).mean())
 
 
-def _rounded(length_m: float | None) -> float | None:
-    return None if length_m is None else round(length_m, 5)
-
-
-_HEAD = (
-    "| setup | modes > 1e-2 | patterns above noise: camera / 1 % | bars, upright x lying, mm: camera / 1 % "
-    "| best linear image, dB: camera / 1 % |\n|---|---|---|---|---|"
-)
-
-
 def setup_table(found: Sequence[Identification]) -> str:
-    """Return one row per setup, and a line that says what holds for all of them.
+    """Return an aligned table with one row per setup, between lines that say what holds for all of them.
 
     Args:
         found: The setups, all with the same settings.
     """
-    rows = [_HEAD]
+    first, settings = found[0], found[0].settings
+    rows = [["setup", "modes > 1e-2", "patterns", "bars, upright x lying, mm", "best linear image, dB"]]
     for one in found:
         camera, fixed = one.at_camera, one.at_noise_std
-        rows.append(
-            f"| {one.name} | {one.modes} | {camera.patterns} / {fixed.patterns} "
-            f"| {_bars(camera)} / {_bars(fixed)} | {camera.psnr_db:.2f} / {fixed.psnr_db:.2f} |"
-        )
-    first, settings = found[0], found[0].settings
-    rows.append(
-        f"\nOn the target plane of {1e3 * settings.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
+        rows.append([one.name, str(one.modes), f"{camera.patterns} / {fixed.patterns}"])
+        rows[-1] += [f"{_bars(camera)} / {_bars(fixed)}", f"{camera.psnr_db:.2f} / {fixed.psnr_db:.2f}"]
+    return (
+        f"From {_frames(settings.frames)}; two figures: at the camera's noise / at {100 * settings.noise_std:g} % of "
+        f"white.\n{aligned(rows)}\n"
+        f"On the target plane of {1e3 * settings.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
         f"mean training target {first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
         f"{settings.cells} x {settings.cells} cells, {settings.height} x {settings.width} pixels."
     )
-    return "\n".join(rows)
+
+
+def _frames(count: int) -> str:
+    return "one frame" if count == 1 else f"the mean of {count} frames"
 
 
 def _bars(one: NoiseLevelResult) -> str:

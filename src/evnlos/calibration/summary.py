@@ -25,6 +25,7 @@ from evnlos.files import write_atomically
 from evnlos.registry import __version__
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import CALIBRATED_FILE, TRAINING_FILE, FittedSetup
+from evnlos.types import aligned
 
 CALIBRATION_VALUES_FILE = "calibration.json"
 TARGETS = "targets"
@@ -146,7 +147,7 @@ def table(rows: list[Row]) -> str:
         cells.append(
             [row.name, f"{row.before:.4g}", f"{row.after:.4g}", error, " ".join((row.unit, row.note)).strip()]
         )
-    return _aligned(cells)
+    return aligned(cells)
 
 
 def residual_table(fit: SetupFit) -> str:
@@ -158,7 +159,7 @@ def residual_table(fit: SetupFit) -> str:
     cells = [["residual, % of standard deviation", "before", "after", "noise alone"]]
     for name, r in fit.residuals.items():
         cells.append([name, *(f"{100 * v:.1f}" for v in (r.before, r.after, r.noise))])
-    return _aligned(cells)
+    return aligned(cells)
 
 
 def steps_table(fit: SetupFit) -> str:
@@ -171,18 +172,12 @@ def steps_table(fit: SetupFit) -> str:
         return ""
     cells = [["step of the wall's fit, % of what was left beside the noise", "taken away", ""]]
     cells += [[n, f"{100 * share:.1f}", "kept" if kept else "left out"] for n, (share, kept) in steps.items()]
-    return _aligned(cells)
+    return aligned(cells)
 
 
 def _steps(fit: SetupFit) -> dict[str, tuple[float, bool]]:
     setup = fit.simulation.setup
     return setup.steps() if isinstance(setup, FittedSetup) else {}
-
-
-def _aligned(cells: list[list[str]]) -> str:
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells]
-    return "\n".join(lines)
 
 
 def warnings_of(fit: SetupFit) -> list[str]:

@@ -351,8 +351,8 @@ class IdentifyCommand:
             print(f"{one.name}: {one.verdict}")
             for warning in one.warnings:
                 say(f"warning: {one.name}: {warning}")
-        for limit in limits.values():
-            print(f"\n{limit.table()}")
+        whole = "what a whole sequence of frames, of events and of both shows: --bounds (half a minute per setup)"
+        print("\n".join(f"\n{limit.table()}" for limit in limits.values()) or whole)
         if self.out is not None:
             names = ["identify.json", *(Path(one).name for one in written if one)]
             print(f"{self.out}: {', '.join(names)}")
