@@ -157,6 +157,8 @@ def test_help_needs_no_library_of_the_work_and_says_the_same() -> None:
         (["capture", "check", "nope"], "nope is not a folder"),
         (["capture", "init", "nope", "--camera", "evk5"], "did you mean evk4"),
         (["verify", "nope"], "nope is no dataset"),
+        (["import", "docs", "--test", "Q", "--out", "d"], "named Q or shows it; hold out some of docs"),
+        (["import", "--test", "Q", "docs", "--out", "d"], "no captures given; name a capture folder, before"),
         (["demo", "--captures", "nope/*"], "nope/* matches nothing"),
         (["experiment", "nope"], "mismatch"),
         (["experiment", "mismatch", "--setups", "nope"], "two-lobes"),

@@ -1,8 +1,7 @@
 """Commands that make and check data: `simulate`, `lab`, `capture`, `import`.
 
 - `evnlos simulate`: config in, dataset of shards out. `evnlos lab`: a setup in, pseudo-real captures out.
-- `evnlos capture`: begin a capture folder, and check what was recorded into it.
-- `evnlos import`: capture folders in, dataset of shards out.
+- `evnlos capture`: begin a capture folder, and check it. `evnlos import`: such folders in, a dataset out.
 """
 
 from __future__ import annotations
@@ -32,10 +31,12 @@ from evnlos.data import (
     read_capture,
     simulate,
 )
+from evnlos.data.capture import by_name
 from evnlos.data.capture_check import Finding, check_capture, compare_clocks, compare_published
 from evnlos.data.capture_info import CAMERAS, CaptureInfo, begin_capture
 from evnlos.data.lab import Lab, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
+from evnlos.data.sampling import split_of
 from evnlos.data.simulations import PRESETS, estimate
 from evnlos.errors import ConfigError, DataError, EvnlosError, UnknownNameError
 from evnlos.files import check_folder, write_atomically
@@ -357,16 +358,16 @@ class ImportCommand:
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
     check_images: bool = True
-    """Draw one image per capture (frame, events, both, curves over time) into the folder checks of the
-    dataset."""
+    """Draw one image per capture (frame, events, both, curves) into the folder checks of the dataset."""
     json: bool = False
     """Print one JSON object."""
     sampling: Sampling = field(default_factory=Sampling)
     """Resolution and representation."""
 
     def check_names(self) -> None:
-        """Refuse a capture that is not there."""
+        """Refuse a capture that is not there, and names of none."""
         check_there(read_capture, *self.captures)
+        split_of([*by_name([one.resolve() for one in self.captures])], [*self.test], [*self.validation])
 
     def run(self) -> None:
         """Import, with a progress bar over the captures."""
@@ -384,8 +385,8 @@ class ImportCommand:
                 progress=progress,
             )
         counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
-        text = f"{self.out}: {_counted(len(dataset.objects()))} ({counts})"
-        result(self.json, {"out": str(self.out), "split": dataset.split}, text)
+        about = {"out": str(self.out), "split": dataset.split}
+        result(self.json, about, f"{self.out}: {_counted(len(dataset.objects()))} ({counts})")
         if self.check_images and not self.json:
             print(f"check images: {self.out / 'checks'}")
 
@@ -393,8 +394,6 @@ class ImportCommand:
         """Tell what was done to a capture, and draw it."""
         tqdm.write(f"{capture.name}: {'; '.join(capture.notes)}", file=sys.stderr)  # above the bar
         if self.check_images:
-            folder = self.out / "checks"
-            folder.mkdir(exist_ok=True)
             drawn = io.BytesIO()
             check_image(capture).save(drawn, "PNG")
-            write_atomically(folder / f"{capture.name}.png", drawn.getvalue())
+            write_atomically(self.out / "checks" / f"{capture.name}.png", drawn.getvalue())

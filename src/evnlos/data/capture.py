@@ -333,8 +333,6 @@ def import_captures(
         DataError: No folder, two captures of one name, or a held-out name that no capture has.
     """
     paths = by_name([Path(folder).resolve() for folder in folders])
-    if not paths:
-        raise DataError("no captures given; name at least one capture folder")
     split = split_of(list(paths), list(test), list(validation))
     # Read every description first: a wrong folder is an error before anything is written.
     for path in paths.values():

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from evnlos.config import check_made
 from evnlos.data.capture_info import CaptureInfo, MotionInfo, RegistrationInfo, TargetInfo, inside
 from evnlos.data.frames import find_dots, homography_from_points, read_image, registration_error
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.events import (
     FrameStack,
     event_histogram,
@@ -302,12 +302,16 @@ def split_of(names: list[str], test: list[str], validation: list[str]) -> dict[s
     """Return which captures are learned from, and which are held out, by name or character.
 
     Raises:
-        DataError: A held-out name that no capture has, or one that is held out twice.
+        UnknownNameError: No capture, or a held-out name that none has.
+        DataError: One that is held out twice.
     """
+    if not names:
+        raise UnknownNameError("no captures given; name a capture folder, before flags that take several words")
     split: dict[str, list[str]] = {"train": [], "validation": [], "test": []}
     for wanted in (*test, *validation):
         if not any(wanted in (name, character_of(name)) for name in names):
-            raise DataError(f"no capture is named {wanted} or shows it; held-out names must be among them")
+            there = ", ".join(sorted(names))
+            raise UnknownNameError(f"no capture is named {wanted} or shows it; hold out some of {there[:300]}")
     for name in names:
         keys = {name, character_of(name)}
         in_test, in_validation = bool(keys & set(test)), bool(keys & set(validation))
