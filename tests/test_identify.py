@@ -269,7 +269,11 @@ def test_command(tmp_path, capsys):
     assert "training data" in found["verdict"]
     main(["identify", "matte-near", "hard-far", "--out", str(tmp_path / "o"), *small])
     shown = capsys.readouterr().out
-    assert "\nmatte-near  3  " in shown and "hard-far: From one frame of this wall" in shown and "--bounds" in shown
+    assert (
+        "\nmatte-near  3  " in shown
+        and "hard-far: From one frame of this wall" in shown
+        and "--bounds" in shown
+    )
     names = {path.name for path in (tmp_path / "o").iterdir()}
     assert names == {"identify_matte-near.png", "identify_hard-far.png", "identify_setups.png", "identify.json"}
     assert len(json.loads((tmp_path / "o" / "identify.json").read_text())) == 2

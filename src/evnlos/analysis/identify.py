@@ -33,11 +33,7 @@ _EXTRA_MODES = 1.1
 
 
 def verdict(
-    patterns: int,
-    finest_m: tuple[float | None, float | None],
-    stroke_m: float,
-    target_size_m: float,
-    frames: int = 1,
+    patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, target_size_m: float
 ) -> str:
     """Return in a sentence what a reconstruction with this setup would be.
 
@@ -49,7 +45,6 @@ def verdict(
         finest_m: Width of the finest upright and lying bars that are resolved, metres; None where none are.
         stroke_m: Typical stroke of the targets, metres.
         target_size_m: Side of the target plane, metres.
-        frames: How many frames of a target at rest are averaged.
 
     Example:
         >>> verdict(3, (None, None), 0.008, 0.08).split(": ")[1]
@@ -72,7 +67,7 @@ def verdict(
         meaning = f"the rough shape is measured, {fine}: their detail would come from the training data"
     else:
         meaning = "a legible reconstruction would come from the training data, not from the measurement"
-    return f"From {_frames(frames)} of this wall {patterns} patterns can be distinguished, and {bars}: {meaning}."
+    return f"From one frame of this wall {patterns} patterns can be distinguished, and {bars}: {meaning}."
 
 
 def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float) -> str | None:
@@ -169,7 +164,8 @@ class Identification:
     @property
     def wall(self) -> str:
         """What the wall allows, in one sentence that does not hang on the grid of the analysis."""
-        return f"from {_frames(self.settings.frames)} of this wall, {self.verdict.partition(': ')[2].removesuffix('.')}"
+        told = _frames(self.settings.frames)
+        return f"from {told} of this wall, {self.verdict.partition(': ')[2].removesuffix('.')}"
 
     def summary(self, arrays: bool = False) -> dict[str, Any]:
         """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
@@ -265,7 +261,9 @@ def identify(
         targets.test[targets.typical].reshape(settings.target_plane.shape),
         at_camera,
         at_noise_std,
-        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, settings.target_size_m, settings.frames),
+        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, settings.target_size_m).replace(
+            "one frame", _frames(settings.frames)
+        ),
         tuple(warnings),
     )
 
@@ -383,8 +381,8 @@ def setup_table(found: Sequence[Identification]) -> str:
         rows.append([one.name, str(one.modes), f"{camera.patterns} / {fixed.patterns}"])
         rows[-1] += [f"{_bars(camera)} / {_bars(fixed)}", f"{camera.psnr_db:.2f} / {fixed.psnr_db:.2f}"]
     return (
-        f"From {_frames(settings.frames)}; two figures: at the camera's noise / at {100 * settings.noise_std:g} % of "
-        f"white.\n{aligned(rows)}\n"
+        f"From {_frames(settings.frames)}; two figures: at the camera's noise / at {100 * settings.noise_std:g} % "
+        f"of white.\n{aligned(rows)}\n"
         f"On the target plane of {1e3 * settings.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
         f"mean training target {first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
         f"{settings.cells} x {settings.cells} cells, {settings.height} x {settings.width} pixels."

@@ -217,11 +217,15 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
         if not end.code:
             raise
         text = _plain(in_one_line(said.getvalue()))
-        if (unknown := re.search(r"Unrecognized options: (--[\w.-]+)", text)) and "Perhaps you meant" not in text:
+        if (
+            unknown := re.search(r"Unrecognized options: (--[\w.-]+)", text)
+        ) and "Perhaps you meant" not in text:
             with contextlib.redirect_stdout(io.StringIO()) as page, contextlib.suppress(SystemExit):
                 tyro.cli(command, args=["--help"], default=default, config=config)
             flags = set(re.findall(r"--[\w.-]*\w", page.getvalue()))
-            text += "".join(f"; perhaps you meant {one}" for one in difflib.get_close_matches(unknown[1], flags, 1))
+            text += "".join(
+                f"; perhaps you meant {one}" for one in difflib.get_close_matches(unknown[1], flags, 1)
+            )
         raise UnfitWordsError(f"{text}; see evnlos {verb} --help") from None
     except (ArithmeticError, MemoryError, ValueError) as error:  # of a setting that only fits together
         raise ConfigError(f"the settings do not fit together ({error}); see evnlos {verb} --help") from None

@@ -351,7 +351,7 @@ class IdentifyCommand:
             print(f"{one.name}: {one.verdict}")
             for warning in one.warnings:
                 say(f"warning: {one.name}: {warning}")
-        whole = "what a whole sequence of frames, of events and of both shows: --bounds (half a minute per setup)"
+        whole = "what a whole sequence of frames, of events, of both shows: --bounds (half a minute per setup)"
         print("\n".join(f"\n{limit.table()}" for limit in limits.values()) or whole)
         if self.out is not None:
             names = ["identify.json", *(Path(one).name for one in written if one)]

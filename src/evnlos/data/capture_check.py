@@ -168,7 +168,8 @@ def _motion(capture: Capture) -> Iterator[Finding]:
         angle < 15 and explained > 0.8,
         angle < 45 and explained > 0.4,
         f"the light's path is {angle:.0f} degrees off the stated direction (15 is safe), which explains "
-        f"{100 * max(explained, 0):.0f} % of it (80 % is safe); speed and start are not checked from one capture",
+        f"{100 * max(explained, 0):.0f} % of it (80 % is safe); "
+        "speed and start are not checked from one capture",
         "mend direction, start_m and start_us of motion, or leave motion out and let `evnlos track` find it",
     )
 
