@@ -266,12 +266,12 @@ def main() -> None:
     lines = ["# Cleaning", "", machine("eventcv", "dv-processing"), ""]
     for title, scene in scenes.items():
         rate = len(scene) / SECONDS / WIDTH / HEIGHT
-        lines += [f"## {title}: {len(scene):,} events, {rate:.2f} a second and pixel", "", *head]
+        lines += [f"## {title}: {len(scene):,} events, {rate:.2f} per pixel per second", "", *head]
         for rate_hz in (0.3, 3.0):
             events, is_scene = labelled(scene, background(rate_hz))
             for name, make in windowed().items():
                 setting, scores = at_equal_work(make, events, is_scene)
-                lines.append(row(f"{rate_hz} Hz a pixel", name, setting, scores))
+                lines.append(row(f"{rate_hz} Hz per pixel", name, setting, scores))
                 print(lines[-1], flush=True)
         events, is_scene = labelled(scene, hot_pixels())
         tools: dict[str, tuple[str, Filter]] = {

@@ -328,7 +328,7 @@ def main() -> None:
         "",
         machine(),
         "",
-        *table(results, "ns a pixel-step", lambda _: 1e9 / pixel_steps),
+        *table(results, "ns per pixel-step", lambda _: 1e9 / pixel_steps),
     ]
     del light, gray
     gray, times = long_video(height, width, 500)

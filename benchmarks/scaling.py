@@ -141,7 +141,7 @@ def page(found: list[Sweep], rates: dict[int, float], cores: int) -> str:
         "",
         f"Nodes of {cores} cores of this speed, all busy.",
     ]
-    lines += ["", "| preset | CPU s an object | CPU hours | wall time |", "|---|---|---|---|"]
+    lines += ["", "| preset | CPU s per object | CPU hours | wall time |", "|---|---|---|---|"]
     for name, config in (("default", default()), ("paper", paper())):
         cost = one_object(config, 2)
         hours = OBJECTS * cost / 3600

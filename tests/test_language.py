@@ -18,6 +18,7 @@ BANNED = {
     "so it may": "the same happens",
     "which it never saw": "held out from ...",
     "what was said here": "delete it; the changelog tells what changed",
+    r"\" a second\"": "per",
     r"\bit were\b": "it was, or it is",
     "takes no look": "is skipped",
     r"nor does the": "say what it does",
@@ -33,12 +34,13 @@ BANNED = {
     rf"\b{RATES} an? {UNITS}\b(?! and the)": "per",
 }
 """What is banned, as a regular expression, and what to write."""
+ROOMS = ("src", "benchmarks", "tools", "examples")
 
 
 def messages() -> list[tuple[str, str]]:
     """Return every text of the code with its place: messages, help and docstrings."""
     found = []
-    for path in sorted((ROOT / "src").rglob("*.py")):
+    for path in sorted(one for room in ROOMS for one in (ROOT / room).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found += [(f"{path.name}:{node.lineno}", node.value)]
@@ -54,7 +56,17 @@ def pages() -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("where", [pages, messages])
+def screens() -> list[tuple[str, str]]:
+    """Return the lines of what a browser shows, of templates and of settings, with their places."""
+    found = []
+    for ending in ("html", "js", "css", "yaml"):
+        for path in sorted((ROOT / "src").rglob(f"*.{ending}")):
+            lines = path.read_text(encoding="utf-8").splitlines()
+            found += [(f"{path.name}:{number}", line) for number, line in enumerate(lines, 1)]
+    return found
+
+
+@pytest.mark.parametrize("where", [pages, messages, screens])
 def test_banned_words_stand_nowhere(where) -> None:
     ban = {re.compile(word, re.IGNORECASE): cure for word, cure in BANNED.items()}
     wrong = []

@@ -11,7 +11,7 @@ and files of that version in tests/upgrade.
 
 An environment is a fresh virtual one that holds the wheel and what its dependencies name, with what these name
 in turn; nothing of an extra, nothing of development. The packages are those of the Python that runs this,
-linked file by file: no index is asked.
+linked file by file, without an index.
 """
 
 from __future__ import annotations
