@@ -381,8 +381,8 @@ def setup_table(found: Sequence[Identification]) -> str:
         rows.append([one.name, str(one.modes), f"{camera.patterns} / {fixed.patterns}"])
         rows[-1] += [f"{_bars(camera)} / {_bars(fixed)}", f"{camera.psnr_db:.2f} / {fixed.psnr_db:.2f}"]
     return (
-        f"From {_frames(settings.frames)}; two figures: at the camera's noise / at {100 * settings.noise_std:g} % "
-        f"of white.\n{aligned(rows)}\n"
+        f"From {_frames(settings.frames)}; two figures: at the camera's noise / at "
+        f"{100 * settings.noise_std:g} % of white.\n{aligned(rows)}\n"
         f"On the target plane of {1e3 * settings.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
         f"mean training target {first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
         f"{settings.cells} x {settings.cells} cells, {settings.height} x {settings.width} pixels."
