@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from evnlos.cli import VERBS
+from evnlos.cli import VERBS, main
 from evnlos.config import from_dict
 from evnlos.data import CaptureInfo, Simulation
+from test_cli_events import moving_bar
+from test_video import write_container
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text()
@@ -34,7 +36,9 @@ def test_python_snippets_print_what_they_say() -> None:
 
 
 def test_yaml_snippets_load() -> None:
-    capture, settings = (yaml.safe_load(code) for kind, code in BLOCKS if kind == "yaml")
+    page = (ROOT / "docs" / "quickstart.md").read_text()
+    page = page[page.index("## A capture and settings in YAML") :]
+    capture, settings = map(yaml.safe_load, re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL))
     assert from_dict(Simulation, settings).pixel.refractory_s == 0.001
     assert from_dict(CaptureInfo, capture).target.name == "R"
 
@@ -46,7 +50,7 @@ def test_every_command_is_listed() -> None:
 
 
 def test_the_readme_is_three_screens_with_three_doors() -> None:
-    assert len(TEXT.splitlines()) <= 140
+    assert len(TEXT.splitlines()) <= 120
     assert "| I want events | I have a wall | I want to learn |" in TEXT
     assert "docs/figures/setup_paper.svg" in TEXT
 
@@ -74,6 +78,19 @@ def test_make_targets_named_in_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
     for target in set(re.findall(r"(?:^ +|`)make (\w+)", TEXT, flags=re.MULTILINE)):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+
+
+def test_the_commands_of_the_events_door_run(tmp_path, monkeypatch, capsys) -> None:
+    """As they are written, on a video of the name that they use."""
+    monkeypatch.chdir(tmp_path)
+    write_container(tmp_path / "clip.mp4", moving_bar(), list(range(0, 480, 40)))
+    text = TEXT[TEXT.index("## Install") :]
+    lines = re.search(r"(?:^    .*\n)+", text, flags=re.MULTILINE)[0].strip().splitlines()
+    commands = [shlex.split(line)[1:] for line in lines if line.strip().startswith("evnlos ")]
+    assert [words[0] for words in commands] == ["events", "preview"]
+    for words in commands:
+        main(words)
+    assert {path.name for path in tmp_path.iterdir()} == {"clip.mp4", "events.h5", "events.gif"}
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
