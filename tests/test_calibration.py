@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+import evnlos
 from evnlos.calibration import (
     Calibration,
     Residual,
@@ -29,6 +30,7 @@ from evnlos.calibration import (
     warnings_of,
     write_setup,
 )
+from evnlos.calibration.captures import paper
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import _block_counts, count_map, read_recordings, within
 from evnlos.calibration.frame_model import FrameModel, fit_frame_noise, frame_doubt, working_shape
@@ -39,7 +41,7 @@ from evnlos.config import load_yaml, save_yaml
 from evnlos.data import load_pattern, read_capture
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation, simulate_object
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse import FrameTerm, handwritten_prior, sequence_light
 from evnlos.scene import FontGlyphs, pen_width
 from evnlos.setups import PaperSetup, RadiometricSetup, load_setup
@@ -216,6 +218,28 @@ def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
     assert isinstance(setup.setup, PaperSetup)
     found = json.loads((out / "calibration.json").read_text())["residuals"]["frames held out"]
     assert found["after"] < 0.25 < found["before"]
+    start = replace(paper().start, setup=replace(paper().start.setup, field_of_view_m=0.6))
+    settings = Calibration(exclude=("A", "E", "O"), holdout=("4",), events=False, columns=24, start=start)
+    looked, steps = [], []
+    fit = evnlos.calibrate(folders, tmp_path / "python", settings, look=looked.append, progress=steps.append)
+    assert looked == [fit] and (fit.simulation, fit.held_out) == (setup, ("lab_4",))
+    assert [step.done for step in steps] == [0, 1, 2, 3]
+    for name in ("setup.yaml", "training.yaml", "calibration.json", "pattern.safetensors"):
+        assert (tmp_path / "python" / name).read_bytes() == (out / name).read_bytes(), name
+
+
+def test_calibrate_refuses_before_it_reads(copies, tmp_path) -> None:
+    (copies[0] / "capture.yaml").write_text("no: [capture")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "setup.yaml").touch()
+    with pytest.raises(ConfigError, match=r"old/setup\.yaml exists"):
+        evnlos.calibrate(copies, tmp_path / "old")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UnknownNameError, match=r"empty holds no capture\.yaml"):
+        evnlos.calibrate([*copies, tmp_path / "empty"])
+    with pytest.raises(DataError, match=r"0 capture\(s\) are left"):
+        evnlos.calibrate([], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
 
 
 def test_excluded_captures_are_not_even_read(copies) -> None:

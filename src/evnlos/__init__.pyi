@@ -19,6 +19,7 @@ from . import tracking as tracking
 from . import training as training
 from .analysis import evaluate as evaluate
 from .analysis import load_model as load_model
+from .calibration import calibrate as calibrate
 from .cameras import EventCamera as EventCamera
 from .cameras import EventPixel as EventPixel
 from .cameras import FrameCamera as FrameCamera

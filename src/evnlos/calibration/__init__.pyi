@@ -5,7 +5,7 @@ from .captures import CaptureSet as CaptureSet
 from .captures import read_capture_set as read_capture_set
 from .event_fit import PixelFit as PixelFit
 from .event_fit import fit_pixel as fit_pixel
-from .event_fit import write_event_errors as write_event_errors
+from .event_statistics import write_event_errors as write_event_errors
 from .fit import Example as Example
 from .fit import SetupFit as SetupFit
 from .fit import Shown as Shown
@@ -37,6 +37,7 @@ from .pixel_report import KnownLightFit as KnownLightFit
 from .pixel_report import fit_known_light as fit_known_light
 from .pixel_statistics import simulated_events as simulated_events
 from .summary import CALIBRATION_VALUES_FILE as CALIBRATION_VALUES_FILE
+from .summary import calibrate as calibrate
 from .summary import calibration_values as calibration_values
 from .summary import expectation as expectation
 from .summary import residual_table as residual_table

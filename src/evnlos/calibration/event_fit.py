@@ -1,17 +1,15 @@
 """Fitting the event pixel: simulate under the fitted light until the figures of the recordings agree.
 
 - The parameters of a pixel, each with its error, and how well they explain recordings that were held out.
-- What a calibrated setup gets wrong of the events of its own captures, for all that are solved after them.
+- The fitted numbers as rows of the calibration's table, and in words where they cannot be believed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,16 +28,8 @@ from evnlos.calibration.event_statistics import (
 )
 from evnlos.calibration.transport_fit import Residual, forward_jacobian, levenberg_marquardt
 from evnlos.cameras import EventPixel, PixelSettings
-from evnlos.config import load_yaml
-from evnlos.data import Simulation, read_capture
-from evnlos.data.pool import run_in_order
-from evnlos.errors import ConfigError
-from evnlos.inverse.event_images import EVENT_ERRORS_FILE, EventErrors, event_statistic
-from evnlos.inverse.prior import PatternPrior
-from evnlos.inverse.sequence_statistic import EventStatistic
-from evnlos.machine import Progress, Step, note, silent
-from evnlos.setups import calibrated_file
-from evnlos.types import Events, target_side_m
+from evnlos.machine import note
+from evnlos.types import Events
 
 EVENT_RESIDUALS = ("counts held out", "surfaces held out")
 """Residuals that the event pixel decides; where they got worse the light path still stands."""
@@ -56,8 +46,8 @@ CONTINUOUS = "continuous"
 _MOST_NOISE = 10.0  # times the events of pixels that see nothing
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
+_TOLD_RATIO = 8.0  # of the highest cutoff that agrees to the lowest: more is no answer
 _SLOW_PX = 1_000  # of the fit of a model that is slow to simulate
-_MOST_CAPTURES = 16  # that tell of errors: a second or two each
 
 
 @dataclass(frozen=True)
@@ -291,76 +281,60 @@ def shortest_interval_s(events: Sequence[Events], share: float = 1e-3) -> float:
 
 
 @dataclass(frozen=True)
-class _Solved:
-    """What the events of a capture say, and its target."""
-
-    name: str
-    statistic: EventStatistic
-    prior: PatternPrior
-    truth: NDArray[np.float32]
-
-
-def _solve(setup: str, side_m: float, folder: Path) -> _Solved | None:
-    """Solve the events of a capture; None where it has none, or its target or motion is not known.
-
-    Raises:
-        ConfigError: No law of the setup's event model is known.
-    """
-    capture = read_capture(folder, needs_frames=False)
-    target = capture.target
-    if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
-        return None
-    of = capture.events, capture.frame_times_us, capture.motion
-    statistic, prior, _ = event_statistic(*of, setup, side_m)
-    return _Solved(capture.name, statistic, prior, target.rasterise(prior.target_plane))
-
-
-def write_event_errors(
-    setup: Path,
-    captures: Iterable[Path],
-    names: Collection[str],
-    progress: Progress = silent,
-    workers: int = 1,
-) -> EventErrors | None:
-    """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
-
-    Newly drawn sequences err as it says (`evnlos.models.DrawnSequences`), and the surface `corrected` takes it
-    into account: for a capture that is among these, what the others showed. Whether a network gains by that,
-    only that network tells (`evnlos.training.best_shown`); captures tell what they gain before any network.
+class Row:
+    """One fitted number.
 
     Args:
-        setup: Folder of a calibrated setup.
-        captures: Capture folders.
-        names: Names of the captures that the setup was calibrated with; of more than 16 every so many are
-            taken. Those without events, of unknown or several targets, or of unknown motion, are passed over.
-        progress: Called as the captures are read.
-        workers: Processes that solve the captures; 0 is one for each core.
-
-    Returns:
-        The errors; None, and no file is there, where no capture shows them, or no law of the setup's event
-        model is known.
+        name: Dotted name in the simulation's settings.
+        before: Its value at the start.
+        after: Its fitted value.
+        error: Standard error; None where none is known.
+        unit: Its unit.
+        note: What the captures say about it, beyond a number.
     """
-    learned = [folder for folder in captures if folder.resolve().name in names]
-    learned = learned[:: max(1, -(-len(learned) // _MOST_CAPTURES))]
-    (setup / EVENT_ERRORS_FILE).unlink(missing_ok=True)
-    if not learned:
-        return None
-    side_m = target_side_m(load_yaml(Simulation, calibrated_file(setup)).sampling.canvas)
-    what, solved = "errors of the events", list[_Solved]()
-    progress(Step(what, 0, len(learned), "captures"))
-    try:
-        with closing(run_in_order(partial(_solve, str(setup), side_m), learned, workers)) as found:
-            for done, one in enumerate(found, start=1):
-                solved += [one] if one else []
-                progress(Step(what, done, len(learned), "captures"))
-    except ConfigError:
-        return None
-    if not solved:
-        return None
-    prior = solved[0].prior
-    statistics, truths = [one.statistic for one in solved], [one.truth for one in solved]
-    errors = EventErrors.of([one.name for one in solved], statistics, prior, truths)
-    return errors.write(setup, errors.gain_db(statistics, prior, truths))
+
+    name: str
+    before: float
+    after: float
+    error: float | None
+    unit: str
+    note: str = ""
+
+
+def pixel_rows(fit: PixelFit, start: Any) -> list[Row]:
+    """Return the fitted numbers of an event pixel.
+
+    Args:
+        fit: The fitted pixel.
+        start: The pixel that the search began with.
+    """
+    pixel, error = fit.pixel, fit.error
+    rows = [
+        Row(
+            f"setup.pixel.{name}",
+            getattr(start, name, getattr(pixel, name)),
+            getattr(pixel, name),
+            value,
+            _unit_of(name),
+        )
+        for name, value in error.items()
+    ]
+    if fit.cutoff_range_hz is not None:
+        low, high = fit.cutoff_range_hz
+        told = high / low < _TOLD_RATIO
+        tried = f"of those tried: {low:g} to {high:g}" if told else f"not identified: {low:g} to {high:g} agree"
+        cutoff = getattr(pixel, "cutoff_hz", 0.0)
+        rows.append(Row("setup.pixel.cutoff_hz", start.cutoff_hz, cutoff, None, "Hz", tried))
+    if hasattr(pixel, "refractory_s"):
+        bound = f"not identified: at most {fit.dead_time_s:g}"
+        kept = getattr(pixel, "refractory_s", 0.0)
+        rows.append(Row("setup.pixel.refractory_s", start.refractory_s, kept, None, "s", bound))
+    return rows
+
+
+def _unit_of(name: str) -> str:
+    endings = {"_per_dn_hz": "Hz/DN", "_a_per_dn": "A/DN", "_hz": "Hz", "_dn": "DN", "_a": "A", "_factor": ""}
+    return next((unit for ending, unit in endings.items() if name.endswith(ending)), "log units")
 
 
 def went(name: str, residuals: Mapping[str, Residual]) -> str:

@@ -1,13 +1,17 @@
 """Statistics of event recordings that a pixel's settings decide, beside those of simulated ones.
 
 - Recorded events beside simulated ones: maps of counts, and the time surfaces that a network sees.
+- What a calibrated setup gets wrong of the events of its own captures, for all that are solved after them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +21,25 @@ from evnlos.calibration.frame_model import local_square
 from evnlos.calibration.transport_fit import Residual
 from evnlos.cameras import PixelSettings, simulate_events
 from evnlos.cameras.streams import WHITE_DN
+from evnlos.config import load_yaml
+from evnlos.data import Simulation, read_capture
+from evnlos.data.pool import run_in_order
 from evnlos.data.sampling import Sampling, make_samples, reduce_by_area
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from evnlos.events import stride_for, thin_events
-from evnlos.machine import note
-from evnlos.setups import Setup
-from evnlos.types import Events, derive_seed
+from evnlos.inverse.event_images import EVENT_ERRORS_FILE, EventErrors, event_statistic
+from evnlos.inverse.prior import PatternPrior
+from evnlos.inverse.sequence_statistic import EventStatistic
+from evnlos.machine import Progress, Step, note, silent
+from evnlos.setups import Setup, calibrated_file
+from evnlos.types import Events, derive_seed, target_side_m
 
 _STEP_PX = 0.2  # the light is linear in time between two rendered instants
 _MOST_BYTES = 1 << 30
 _ENOUGH_PX = 4000  # pixels that tell as much about a model as all do: they do not see each other
 _MOST_PX = 20_000  # about as many are taken at all
 _AT_ONCE = 32  # instants that are rendered together
+_MOST_CAPTURES = 16  # that tell of errors: a second or two each
 _SETTLE = 0.05  # share of the recording in which the pixels' references forget their start
 _QUIET, _ACTIVE = 0.06, 0.5  # range of the log light of a pixel that sees nothing, and of one that sees much
 
@@ -286,3 +297,76 @@ def _surfaces(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) -
 
 def _rms(values: NDArray) -> float:
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """What the events of a capture say, and its target."""
+
+    name: str
+    statistic: EventStatistic
+    prior: PatternPrior
+    truth: NDArray[np.float32]
+
+
+def _solve(setup: str, side_m: float, folder: Path) -> _Solved | None:
+    """Solve the events of a capture; None where it has none, or its target or motion is not known.
+
+    Raises:
+        ConfigError: No law of the setup's event model is known.
+    """
+    capture = read_capture(folder, needs_frames=False)
+    target = capture.target
+    if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
+        return None
+    of = capture.events, capture.frame_times_us, capture.motion
+    statistic, prior, _ = event_statistic(*of, setup, side_m)
+    return _Solved(capture.name, statistic, prior, target.rasterise(prior.target_plane))
+
+
+def write_event_errors(
+    setup: Path,
+    captures: Iterable[Path],
+    names: Collection[str],
+    progress: Progress = silent,
+    workers: int = 1,
+) -> EventErrors | None:
+    """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
+
+    Newly drawn sequences err as it says (`evnlos.models.DrawnSequences`), and the surface `corrected` takes it
+    into account: for a capture that is among these, what the others showed. Whether a network gains by that,
+    only that network tells (`evnlos.training.best_shown`); captures tell what they gain before any network.
+
+    Args:
+        setup: Folder of a calibrated setup.
+        captures: Capture folders.
+        names: Names of the captures that the setup was calibrated with; of more than 16 every so many are
+            taken. Those without events, of unknown or several targets, or of unknown motion, are passed over.
+        progress: Called as the captures are read.
+        workers: Processes that solve the captures; 0 is one for each core.
+
+    Returns:
+        The errors; None, and no file is there, where no capture shows them, or no law of the setup's event
+        model is known.
+    """
+    learned = [folder for folder in captures if folder.resolve().name in names]
+    learned = learned[:: max(1, -(-len(learned) // _MOST_CAPTURES))]
+    (setup / EVENT_ERRORS_FILE).unlink(missing_ok=True)
+    if not learned:
+        return None
+    side_m = target_side_m(load_yaml(Simulation, calibrated_file(setup)).sampling.canvas)
+    what, solved = "errors of the events", list[_Solved]()
+    progress(Step(what, 0, len(learned), "captures"))
+    try:
+        with closing(run_in_order(partial(_solve, str(setup), side_m), learned, workers)) as found:
+            for done, one in enumerate(found, start=1):
+                solved += [one] if one else []
+                progress(Step(what, done, len(learned), "captures"))
+    except ConfigError:
+        return None
+    if not solved:
+        return None
+    prior = solved[0].prior
+    statistics, truths = [one.statistic for one in solved], [one.truth for one in solved]
+    errors = EventErrors.of([one.name for one in solved], statistics, prior, truths)
+    return errors.write(setup, errors.gain_db(statistics, prior, truths))

@@ -1,10 +1,11 @@
-"""A calibration as a table, as plain values, and as files."""
+"""A calibration from captures to files: the verb `calibrate`, and what it found as a table and plain values."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,19 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from evnlos.calibration.event_fit import EVENT_RESIDUALS, event_warnings, went
-from evnlos.calibration.fit import SetupFit
+from evnlos.calibration.captures import Calibration
+from evnlos.calibration.event_fit import EVENT_RESIDUALS, Row, event_warnings, pixel_rows, went
+from evnlos.calibration.event_statistics import write_event_errors
+from evnlos.calibration.fit import SetupFit, fit_setup
 from evnlos.calibration.transport_fit import Residual, values_of
 from evnlos.calibration.wall_search import WALL_FILE
 from evnlos.config import save_yaml
-from evnlos.data import randomized
+from evnlos.data import captures_in, randomized
 from evnlos.data.fixed_pattern import PATTERN_FILE, save_pattern
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
+from evnlos.machine import Progress, silent
 from evnlos.registry import __version__
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import CALIBRATED_FILE, TRAINING_FILE, FittedSetup
@@ -39,29 +43,6 @@ _DOUBTED = 100.0  # times the noise's variance: the light path misses what the f
 _UNTOLD = "not told by unknown targets: arbitrary"
 _ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
 _TRY = {"known": "another --preset or start", "unknown": "known targets or another start"}
-
-_TOLD_RATIO = 8.0  # of the highest cutoff that agrees to the lowest: more is no answer
-
-
-@dataclass(frozen=True)
-class Row:
-    """One fitted number.
-
-    Args:
-        name: Dotted name in the simulation's settings.
-        before: Its value at the start.
-        after: Its fitted value.
-        error: Standard error; None where none is known.
-        unit: Its unit.
-        note: What the captures say about it, beyond a number.
-    """
-
-    name: str
-    before: float
-    after: float
-    error: float | None
-    unit: str
-    note: str = ""
 
 
 def rows_of(fit: SetupFit, start_pixel: Any, start_camera: Any) -> list[Row]:
@@ -99,40 +80,7 @@ def rows_of(fit: SetupFit, start_pixel: Any, start_camera: Any) -> list[Row]:
     rows += [
         Row(f"{name} after correction", getattr(camera, name), value, None, units[name]) for name, value in left
     ]
-    return rows + _pixel_rows(fit, start_pixel)
-
-
-def _pixel_rows(fit: SetupFit, start: Any) -> list[Row]:
-    if fit.pixel is None:
-        return []
-    pixel, error = fit.pixel.pixel, fit.pixel.error
-    rows = [
-        Row(
-            f"setup.pixel.{name}",
-            getattr(start, name, getattr(pixel, name)),
-            getattr(pixel, name),
-            value,
-            unit_of(name),
-        )
-        for name, value in error.items()
-    ]
-    if fit.pixel.cutoff_range_hz is not None:
-        low, high = fit.pixel.cutoff_range_hz
-        told = high / low < _TOLD_RATIO
-        tried = f"of those tried: {low:g} to {high:g}" if told else f"not identified: {low:g} to {high:g} agree"
-        cutoff = getattr(pixel, "cutoff_hz", 0.0)
-        rows.append(Row("setup.pixel.cutoff_hz", start.cutoff_hz, cutoff, None, "Hz", tried))
-    if hasattr(pixel, "refractory_s"):
-        bound = f"not identified: at most {fit.pixel.dead_time_s:g}"
-        kept = getattr(pixel, "refractory_s", 0.0)
-        rows.append(Row("setup.pixel.refractory_s", start.refractory_s, kept, None, "s", bound))
-    return rows
-
-
-def unit_of(name: str) -> str:
-    """Return the unit of an event pixel's number by its name."""
-    endings = {"_per_dn_hz": "Hz/DN", "_a_per_dn": "A/DN", "_hz": "Hz", "_dn": "DN", "_a": "A", "_factor": ""}
-    return next((unit for ending, unit in endings.items() if name.endswith(ending)), "log units")
+    return rows if fit.pixel is None else rows + pixel_rows(fit.pixel, start_pixel)
 
 
 def table(rows: list[Row]) -> str:
@@ -311,6 +259,55 @@ def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
             for row in rows
         },
     }
+
+
+def calibrate(
+    captures: Iterable[str | Path],
+    out: str | Path | None = None,
+    settings: Calibration | None = None,
+    *,
+    force: bool = False,
+    look: Callable[[SetupFit], None] | None = None,
+    progress: Progress = silent,
+    workers: int = 1,
+) -> SetupFit:
+    """Fit the simulator to captures of a setup, check it on some that are held out, and write what was found.
+
+    `warnings_of` says why a fit should not be believed as it stands, `expectation` what training on it brings.
+
+    Args:
+        captures: Capture folders of one setup and one camera, 3 or more.
+        out: Folder for the files that `write_setup` names and, where events were fitted to known targets, for
+            the errors of events (`events.safetensors`); None writes nothing.
+        settings: What to hold out, what to fit and where to start; None is a wall of rough metal.
+        force: Write the setup also where the fit fails on captures held out, or where the folder has one.
+        look: Called with the fit before anything is written, also where writing is then refused.
+        progress: Called as each stage begins.
+        workers: Processes that solve the captures' events for their errors, 0 is one for each core.
+
+    Returns:
+        The calibrated simulation, its parameters' errors, and the residuals before and after.
+
+    Raises:
+        ConfigError: The folder is a file or holds a setup, or something is measured that the fit has no number
+            for; nothing is read then.
+        DataError: As for `fit_setup`, and as for `write_setup`.
+    """
+    settings = Calibration() if settings is None else settings
+    folders = [Path(one) for one in captures]
+    if out is not None:
+        check_out(Path(out), force)
+    if any(path.is_dir() for path in folders):
+        captures_in(folders)  # a folder that is no capture is named, not counted
+    fit = fit_setup(folders, settings, progress)
+    if look is not None:
+        look(fit)
+    if out is not None:
+        rows = rows_of(fit, settings.start.pixel, settings.start.frame_camera)
+        path = write_setup(fit, rows, Path(out), force)
+        if fit.pixel is not None and fit.known:
+            write_event_errors(path.parent, folders, fit.captures, progress, workers)
+    return fit
 
 
 def check_out(out: Path, force: bool) -> None:

@@ -30,6 +30,7 @@ from evnlos.setups import load_setup
 from evnlos.types import OutFile, OutFolder
 
 if TYPE_CHECKING:
+    from evnlos.calibration.fit import SetupFit
     from evnlos.calibration.scan.film import FilmResult
     from evnlos.calibration.scan.importer import ScanResult
 
@@ -73,56 +74,53 @@ class CalibrateCommand:
         return replace(settings, start=start, events=False)
 
     def check_names(self) -> None:
-        """Refuse a capture that is not there."""
-        from evnlos.data import read_capture
+        """Refuse a capture that is not there, and a folder that is none."""
+        from evnlos.data import captures_in, read_capture
 
         check_there(read_capture, *self.captures)
+        if any(path.is_dir() for path in self.captures):
+            captures_in(self.captures)
 
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""
+        from evnlos.calibration import calibrate, expectation
+        from evnlos.calibration.summary import is_of_no_use
+        from evnlos.setups import TRAINING_FILE
+
+        with ProgressBars() as progress:
+            fit = calibrate(
+                self.captures, self.out, self.settings, force=self.force, look=self._show, progress=progress
+            )
+        if not self.json:
+            training = self.out / TRAINING_FILE
+            print(f"\nto pre-train on:   evnlos simulate --config {training} --out DATASET")
+            print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")
+            print(expectation(fit))
+        if is_of_no_use(fit) and not self.force:
+            raise SystemExit(1)
+
+    def _show(self, fit: SetupFit) -> None:
+        """Print a fit, its warnings, too, and draw captures held out beside it."""
         from evnlos.calibration import (
             calibration_values,
-            fit_setup,
             residual_table,
             rows_of,
             steps_table,
             table,
             warnings_of,
-            write_event_errors,
-            write_setup,
         )
-        from evnlos.calibration.summary import check_out, expectation, is_of_no_use
-        from evnlos.data import captures_in
         from evnlos.plot.results import draw_calibration
-        from evnlos.setups import TRAINING_FILE
 
-        check_out(self.out, self.force)
-        if any(path.is_dir() for path in self.captures):
-            captures_in(self.captures)  # a folder that is no capture is named, not counted
-        with ProgressBars() as progress:
-            fit = fit_setup(self.captures, self.settings, progress)
         rows = rows_of(fit, self.settings.start.pixel, self.settings.start.frame_camera)
-        self.out.mkdir(parents=True, exist_ok=True)
         if self.json:
             print(json.dumps(calibration_values(fit, rows)))
         else:
             print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
             print("\n\n".join(filter(None, (table(rows), residual_table(fit), steps_table(fit)))))
+        self.out.mkdir(parents=True, exist_ok=True)
         drawn(self.out / "check.png", lambda: draw_calibration(fit, self.out / "check.png"))
         for line in warnings_of(fit):
             say(f"warning: {line}")
-        path = write_setup(fit, rows, self.out, self.force)
-        if fit.pixel is not None and fit.known:
-            with ProgressBars() as progress:
-                write_event_errors(self.out, self.captures, fit.captures, progress)
-        if not self.json:
-            print(
-                f"\nto pre-train on:   evnlos simulate --config {path.with_name(TRAINING_FILE)} --out DATASET"
-            )
-            print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")
-            print(expectation(fit))
-        if is_of_no_use(fit) and not self.force:
-            raise SystemExit(1)
 
 
 @dataclass(frozen=True)
