@@ -87,6 +87,7 @@ class CalibrateCommand:
         from evnlos.calibration.summary import is_of_no_use
         from evnlos.setups import TRAINING_FILE
 
+        self.check_names()
         with ProgressBars() as progress:
             fit = calibrate(
                 self.captures, self.out, self.settings, force=self.force, look=self._show, progress=progress
