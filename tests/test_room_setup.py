@@ -1,12 +1,14 @@
 """The room as a setup: moving targets against its operator, and the two renderers against each other."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch
 
-from evnlos.cameras import FrameCamera
+from evnlos.cameras import EventPixel, FrameCamera, ReadoutPixel
 from evnlos.cli.datasets import SimulateCommand
 from evnlos.config import from_dict, to_dict
 from evnlos.data import Simulation
@@ -128,6 +130,32 @@ def test_every_named_room_shows_its_target_and_survives_a_file(name):
     light = wall.irradiance(np.array([0.0, 4.0, 8.0])) - small.ambient_light()
     assert float(light.amax(dim=(1, 2)).min()) > 0.1
     assert float(light.max()) < 1.0
+
+
+def test_rooms_are_read_when_one_is_asked_for():
+    code = (
+        "from evnlos.setups import ROOMS, load_setup\n"
+        "load_setup('main-near'); print(vars(ROOMS).keys() - {'file'})\n"
+        "load_setup('torch'); print(vars(ROOMS).keys() - {'file'})"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["set()", "{'_stated'}"]
+
+
+def test_the_file_of_rooms_states_what_is_meant():
+    camera = FrameCamera(0.016, 10_000.0, 12.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=12)
+    pixel = EventPixel(0.12, 1.4, 0.007, 40.0, 0.15, 0.02, 2e-3, pattern_seed=12, logarithm="true", dark_dn=1.0)
+    one_sided = RoomSetup(
+        reflection=Reflection((Lobe("ggx", 1.0, 0.05, 0.05),), matte=0.0),
+        **{"ambient": 0.05, "ambient_gradient": (0.1, 0.1), "frame_camera": camera, "pixel": pixel},
+        **{"distance_m": 0.28, "camera_distance_m": 0.55, "camera_angle_deg": 33.0, "field_of_view_deg": 32.0},
+    )
+    assert load_setup("one-sided") == one_sided
+    inner = EventPixel(0.15, 0.17, 0.01, 90.0, 0.1, 0.1, 5e-4, pattern_seed=19, logarithm="true", dark_dn=0.5)
+    faults = {"hot_pixel_fraction": 2e-3, "hot_pixel_rate_hz": 20.0, "dead_pixel_fraction": 5e-3}
+    times = {"tick_s": 1e-4, "jitter_s": 2e-4}
+    assert load_setup("slow-bus").pixel == ReadoutPixel(
+        inner, "row", 2e-4, 2e-5, **times, **faults, pattern_seed=19
+    )
 
 
 def test_every_wall_and_every_sensor_is_in_some_room():
