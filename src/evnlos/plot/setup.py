@@ -1,30 +1,22 @@
-"""The setup to scale, the wall's kernel, and the time stamps that rows of pixels send.
+"""The setup to scale, and what a corner shows.
 
 - A setup, to scale, seen from above; SVG in the colours of the page that it stands on.
-- The wall's kernel: curves, what they do to a letter, and the cosine law beside them (paper Fig. 5).
 - What a corner shows: the hidden side over bearing and time, and who moves there.
-- Time stamps of a few rows of pixels, stream beside stream: layers show where a simulator counts in frames.
 """
 
 from __future__ import annotations
 
 import html
 import textwrap
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.events.volume import OFF_HEX, ON_HEX
-from evnlos.optics import DiffuseReflection, tpsf_kernel, tpsf_profile
 from evnlos.plot.figures import new_figure, save_figure, signed_map
-from evnlos.scene import FontGlyphs
 from evnlos.setups import Setup
-from evnlos.types import Events, Plane
 
 if TYPE_CHECKING:
     from evnlos.inverse import CornerImage, FloorSector
@@ -190,130 +182,6 @@ def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
     return (
         f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='{anchor}' fill='currentColor'>{html.escape(words)}</text>"
     )
-
-
-CURVES = (0.2, 0.4, 0.6, 0.8, 0.9)
-"""Mean free paths of the curves, in units of t."""
-PICTURES = (0.4, 0.8, 1.2, 1.6)
-"""Mean free paths of the images, at t = 2."""
-
-
-def cosine_law(rho: NDArray, height: float, power: int = 3) -> NDArray:
-    """Return the light that a point source at a height throws on a plane, over its maximum: cos^power.
-
-    A source that shines alike in all directions gives E ~ cos / r^2, cos^3; one that itself obeys Lambert's law
-    gives cos^4.
-
-    Args:
-        rho: Distance along the plane from the foot of the source, [...], any unit.
-        height: Height of the source, the same unit.
-        power: 3 or 4.
-
-    Example:
-        >>> cosine_law(np.array([0.0, 1.0]), 1.0).round(4)
-        array([1.    , 0.3536])
-    """
-    return (1 + (rho / height) ** 2) ** (-power / 2)
-
-
-def blurred(letter: str, mean_free_path: float, t: float = 2.0, side: int = 96) -> NDArray:
-    """Return a letter after the convolution with the tPSF, rho in samples of 0.02 as in the paper, [H, W]."""
-    name = FontGlyphs(characters=letter)
-    target = name.target(name.objects()[0], 0)
-    plane = Plane(side, side, target.size_m / side)
-    kernel = tpsf_kernel(plane.pitch_m, t=t, mean_free_path=mean_free_path)
-    wall = DiffuseReflection(plane, kernel)(torch.from_numpy(target.rasterise(plane)))
-    middle, half = [n // 2 for n in wall.shape], side
-    image = wall[middle[0] - half : middle[0] + half, middle[1] - half : middle[1] + half]
-    return image.numpy() / float(image.max())
-
-
-def draw_kernel(path: str | Path, letter: str = "R") -> Path:
-    """Draw the kernel's curves and a letter behind each of several walls; needs matplotlib.
-
-    Args:
-        path: The image, PNG or SVG.
-        letter: What is hidden.
-
-    Returns:
-        The path.
-    """
-    figure = new_figure((10.5, 5.6))
-    grid = figure.add_gridspec(2, len(PICTURES), height_ratios=(1.35, 1))
-    axes = figure.add_subplot(grid[0, :])
-    rho = np.linspace(0, 3, 301)
-    for share in CURVES:
-        curve = tpsf_profile(torch.from_numpy(rho), 1.0, share).numpy()
-        (line,) = axes.plot(rho, curve / curve[0], label=f"tPSF, <l> = {share:g} t")
-        law = cosine_law(rho, 1 - share)
-        axes.plot(rho, law, "--", color=line.get_color(), linewidth=0.9)
-    axes.plot([], [], "k--", linewidth=0.9, label="cosine law, source at t - <l>")
-    axes.set(xlabel="rho / t", ylabel="H(rho) / H(0)", xlim=(0, 3), ylim=(0, 1.02))
-    axes.legend(frameon=False)
-    for column, path_length in enumerate(PICTURES):
-        picture = figure.add_subplot(grid[1, column])
-        picture.imshow(blurred(letter, path_length), cmap="gray", vmin=0, vmax=1)
-        picture.set_title(f"t = 2, <l> = {path_length:g}", fontsize=10)
-        picture.set_axis_off()
-    return save_figure(figure, path, dpi=110)
-
-
-def share_on_frame_times(events: Events, times_s: ArrayLike) -> float:
-    """Return the share of events whose time stamp is that of a frame, to the microsecond; NaN without events.
-
-    Args:
-        events: The events of a simulated video.
-        times_s: Times of its frames, [T], seconds.
-
-    Example:
-        >>> events = Events([1000, 1500, 2000, 2001], [0] * 4, [0] * 4, [1] * 4, width=1, height=1)
-        >>> share_on_frame_times(events, [0.001, 0.002])
-        0.5
-    """
-    frames_us = np.round(np.asarray(times_s, dtype=np.float64) * 1e6).astype(np.int64)
-    return float(np.isin(events.t_us, frames_us).mean()) if len(events) else float("nan")
-
-
-def draw_time_stamps(
-    path: str | Path,
-    streams: Mapping[str, Events],
-    times_s: ArrayLike,
-    *,
-    rows: tuple[int, int],
-    window_s: tuple[float, float],
-) -> Path:
-    """Draw column against time of the events of some rows, one panel a stream; needs matplotlib.
-
-    Args:
-        path: The image, PNG or SVG.
-        streams: Events of the same scene by title.
-        times_s: Times of the frames that they were made from, [T], seconds: thin lines.
-        rows: First row, and the row after the last.
-        window_s: Begin and end of what is drawn, seconds.
-
-    Returns:
-        The path.
-    """
-    figure = new_figure((10.5, 3.6))
-    panels = figure.subplots(1, len(streams), sharex=True, sharey=True, squeeze=False)[0]
-    start, stop = window_s
-    frames_ms = 1e3 * np.asarray(times_s, dtype=np.float64)
-    frames_ms = frames_ms[(frames_ms >= 1e3 * start) & (frames_ms <= 1e3 * stop)]
-    for axes, (title, events) in zip(panels, streams.items(), strict=True):
-        shown = (events.y >= rows[0]) & (events.y < rows[1])
-        shown &= (events.t_us >= 1e6 * start) & (events.t_us <= 1e6 * stop)
-        for frame_ms in frames_ms:
-            axes.axvline(frame_ms, color="#d8d8d8", linewidth=0.6, zorder=0)
-        for sign, colour, name in ((True, ON_HEX, "ON"), (False, OFF_HEX, "OFF")):
-            part = events[shown & (events.p == sign)]
-            axes.scatter(part.t_us / 1e3, part.x, s=7, color=colour, linewidths=0, label=name)
-        share = share_on_frame_times(events, times_s)
-        axes.set_title(f"{title}: {100 * share:.3g} % of all events on frame times", fontsize=10)
-        axes.set(xlabel="time, ms", xlim=(1e3 * start, 1e3 * stop))
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("column, pixels")
-    panels[-1].legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=2)
-    return save_figure(figure, path, dpi=110)
 
 
 _TRACKS = ("#d95f02", "#1b9e77", "#7570b3", "#e7298a")  # apart in hue, and drawn with other dashes
