@@ -53,7 +53,7 @@ from evnlos.config import load_yaml, read_yaml, to_dict
 from evnlos.data import Sampling, Simulation, load_pattern, read_capture, read_shard
 from evnlos.data.lab import Lab
 from evnlos.events.recording import Recording, summarise
-from evnlos.inverse.inversion import read_photograph
+from evnlos.inverse import read_photograph
 from evnlos.live.engine import Engine
 from evnlos.live.packet import Packet, pack
 from evnlos.live.udp import UdpSource

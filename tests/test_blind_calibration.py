@@ -7,9 +7,8 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from evnlos.calibration import Calibration, fit_setup
+from evnlos.calibration import Calibration, fit_setup, read_capture_set
 from evnlos.calibration.blind_calibration import CELLS, WRITERS, FrameResiduals, fit_blind
-from evnlos.calibration.captures import read_capture_set
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import handwritten_targets
 from evnlos.setups import PaperSetup, RadiometricSetup

@@ -18,10 +18,12 @@ from PIL import Image
 import evnlos
 from evnlos.calibration import (
     Calibration,
+    FrameModel,
     Residual,
     Shown,
     calibration_values,
     expectation,
+    fit_frame_noise,
     fit_setup,
     fit_transport,
     read_capture_set,
@@ -33,14 +35,13 @@ from evnlos.calibration import (
 from evnlos.calibration.captures import paper
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import _block_counts, count_map, read_recordings, within
-from evnlos.calibration.frame_model import FrameModel, fit_frame_noise, frame_doubt, working_shape
+from evnlos.calibration.frame_model import frame_doubt, working_shape
 from evnlos.calibration.transport_fit import clustered_error, levenberg_marquardt, values_of
 from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
-from evnlos.data import load_pattern, read_capture
+from evnlos.data import SensorSize, Simulation, load_pattern, read_capture, simulate_object
 from evnlos.data.lab import Lab, render_captures
-from evnlos.data.simulate import SensorSize, Simulation, simulate_object
 from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse import FrameTerm, handwritten_prior, sequence_light
 from evnlos.scene import FontGlyphs, pen_width

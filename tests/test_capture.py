@@ -11,8 +11,15 @@ from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
 from evnlos.config import from_dict
-from evnlos.data import Capture, CaptureInfo, capture_samples, character_of, read_shard, reduce_by_area
-from evnlos.data.sampling import Sampling
+from evnlos.data import (
+    Capture,
+    CaptureInfo,
+    Sampling,
+    capture_samples,
+    character_of,
+    read_shard,
+    reduce_by_area,
+)
 from evnlos.errors import DataError
 from watching import Watch, stopped
 

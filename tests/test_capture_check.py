@@ -12,14 +12,12 @@ import pytest
 from PIL import Image
 
 from evnlos.cli import main
-from evnlos.data import CaptureInfo, open_dataset, read_capture
+from evnlos.data import CaptureInfo, SensorSize, open_dataset, read_capture, read_shard
 from evnlos.data.capture_check import Finding, _offset, check_capture, compare_clocks
 from evnlos.data.capture_info import CAMERAS, AlignmentInfo, CameraInfo, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
 from evnlos.data.frames import from_start
 from evnlos.data.lab import Lab, render_captures
-from evnlos.data.simulate import SensorSize
-from evnlos.data.store import read_shard
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs
 from evnlos.setups import RadiometricSetup

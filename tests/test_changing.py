@@ -10,7 +10,7 @@ import yaml
 from PIL import Image
 
 from evnlos.cameras import FrameCamera
-from evnlos.cli.main import main
+from evnlos.cli import main
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.inverse import FilmPrior, Gradient, estimate_film, smooth_modes

@@ -18,8 +18,7 @@ from evnlos.cli import VERBS, main
 from evnlos.config import save_yaml
 from evnlos.data import Samples, Sampling
 from evnlos.machine import ProgressBars
-from evnlos.models import ConfidenceReport, Weights, published_for, save_weights
-from evnlos.models.sequence import SequenceConfig
+from evnlos.models import ConfidenceReport, SequenceConfig, Weights, published_for, save_weights
 from evnlos.report import result_sheet
 
 NETWORK = ["--network.width", "8", "--network.depth", "2"]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.analysis import evaluate, load_model, reconstruct
+from evnlos.analysis import evaluate, identify, load_model, reconstruct
 from evnlos.analysis.confidence import confidence_of, explained, light_gain, risk_coverage
-from evnlos.analysis.identify import QUICK, identify, verdict_on
+from evnlos.analysis.identify import QUICK, verdict_on
 from evnlos.app.views import verdict_box
 from evnlos.cli import main
 from evnlos.config import load_yaml

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 import evnlos.demo
-from evnlos.cli.main import VERBS, main
+from evnlos.cli import VERBS, main
 from evnlos.demo import Demo, HiddenScene, run_scene, scene_of
 from evnlos.errors import ConfigError, DataError, UnknownNameError
 

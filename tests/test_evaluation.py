@@ -14,9 +14,10 @@ from evnlos.analysis import scores as module
 from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.errors import DataError
 from evnlos.models import UNetConfig, Weights
+from evnlos.report import RunResult
 from evnlos.report.pictures import curves_svg
 from evnlos.report.sections import gains_of, losses_of, summary_section
-from evnlos.report.tables import RunResult, best_two, method_of
+from evnlos.report.tables import best_two, method_of
 
 CONVOLUTIONS = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]  # places in torchvision's vgg16.features
 SIDES = [(3, 64), (64, 64), (64, 128), (128, 128), (128, 256), (256, 256), (256, 256)]

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evnlos.calibration.event_fit import CONTINUOUS, choose_pixel, fit_pixel
+from evnlos.calibration import fit_pixel
+from evnlos.calibration.event_fit import CONTINUOUS, choose_pixel
 from evnlos.calibration.event_models import figures_of, is_better, is_near, misfit
 from evnlos.calibration.event_statistics import Recording, thinned
 from evnlos.cameras import (

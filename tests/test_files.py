@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from evnlos import Events, EvnlosError, read_events, write_events
-from evnlos.events.files.aedat4 import write_aedat4
+from evnlos.events import write_aedat4
 from evnlos.files import directory_lock, new_file, new_folder, write_atomically
 
 MOST_BYTES = 40_000

@@ -11,7 +11,8 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation
 from evnlos.errors import DataError
-from evnlos.experiment.presets import evaluation_sets, generalization
+from evnlos.experiment import generalization
+from evnlos.experiment.presets import evaluation_sets
 from evnlos.models import UNetConfig, Weights, save_weights
 from evnlos.models.confidence import fit_confidence
 from evnlos.scene import DrawingGlyphs, HandwritingGlyphs

@@ -16,6 +16,7 @@ from evnlos.scene import (
     HandwritingGlyphs,
     NistGlyphs,
     TargetPlane,
+    character_name,
     find_font,
     fit_to_target_plane,
     fonts,
@@ -25,7 +26,6 @@ from evnlos.scene import (
     read_sd19,
     render_glyph,
 )
-from evnlos.scene.fonts import character_name
 
 
 def ink_box(mask):

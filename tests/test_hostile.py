@@ -23,14 +23,14 @@ from PIL import Image
 
 from evnlos import EvnlosError, read_events, write_events
 from evnlos.app.upload import read_upload
-from evnlos.cli.main import main
+from evnlos.cli import main
 from evnlos.config import config_hash, load_yaml, read_yaml, to_dict
 from evnlos.data import Simulation, open_dataset, read_capture
 from evnlos.data.simulate import object_bytes
 from evnlos.data.simulations import find_faults
 from evnlos.errors import ConfigError, printable
 from evnlos.events.recording import Recording, _Counts
-from evnlos.inverse.inversion import read_photograph
+from evnlos.inverse import read_photograph
 from evnlos.models import UNetConfig
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS

@@ -9,8 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evnlos.analysis.identify import counted, identify, setup_table, singular_values, verdict
-from evnlos.analysis.linearized import AnalysisSettings, LinearEstimator, bars, finest_bars, linearized
+from evnlos.analysis import AnalysisSettings, identify
+from evnlos.analysis.identify import counted, setup_table, singular_values, verdict
+from evnlos.analysis.linearized import LinearEstimator, bars, finest_bars, linearized
 from evnlos.cameras import FrameCamera
 from evnlos.cli import main
 from evnlos.config import save_yaml

@@ -25,7 +25,7 @@ from evnlos.data.lab import (
 from evnlos.data.simulations import default
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
-from evnlos.optics.angular_spectrum import Diffraction
+from evnlos.optics import Diffraction
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, OtherTarget, Scene, SeveralTargets
 from evnlos.setups import PaperSetup, RadiometricSetup, setup_names, setup_preset
 from evnlos.types import Plane

@@ -11,8 +11,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save
 
-from evnlos.analysis.identify import identify
-from evnlos.analysis.linearized import AnalysisSettings
+from evnlos.analysis import AnalysisSettings, identify
 from evnlos.calibration.scan import (
     Patterns,
     ScanCamera,
@@ -32,14 +31,12 @@ from evnlos.calibration.scan.plan import spread_points
 from evnlos.cameras import FrameCamera
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.data import SensorSize, Simulation
-from evnlos.data.simulate import simulate_object
+from evnlos.data import SensorSize, Simulation, simulate_object
 from evnlos.errors import ConfigError, DataError, EvnlosError
-from evnlos.inverse import read_photograph
-from evnlos.inverse.inversion import Inversion, chosen_degree
+from evnlos.inverse import Inversion, read_photograph
+from evnlos.inverse.inversion import chosen_degree
 from evnlos.optics import MatrixTransport
-from evnlos.scene import HandwritingGlyphs, LineMotion, Scene, Target
-from evnlos.scene.glyph_sets import TargetPlane
+from evnlos.scene import HandwritingGlyphs, LineMotion, Scene, Target, TargetPlane
 from evnlos.setups import MeasuredSetup, RadiometricSetup
 from evnlos.setups.files import MEASUREMENT, About, Measurement, write_measurement
 from evnlos.types import Plane

@@ -10,8 +10,7 @@ import pytest
 from evnlos.calibration import CALIBRATION_VALUES_FILE
 from evnlos.demo import ROBUST, Demo, run_demo
 from evnlos.errors import CalibrationError, ConfigError, DataError
-from evnlos.experiment import Record, Study
-from evnlos.experiment.study import write_record
+from evnlos.experiment import Record, Study, write_record
 from evnlos.models import layers_of
 from evnlos.studies import finding, mismatch_table, run_mismatch
 

@@ -13,22 +13,18 @@ import pytest
 import torch
 
 from chromium import Chromium, missing
-from evnlos.analysis import Evaluation
+from evnlos.analysis import AnalysisSettings, Evaluation, identify, score
 from evnlos.analysis.confidence import ConfidenceCheck
-from evnlos.analysis.identify import identify
-from evnlos.analysis.linearized import AnalysisSettings
-from evnlos.analysis.scores import score
-from evnlos.cli.main import command_of, main
+from evnlos.cli import main
+from evnlos.cli.main import command_of
 from evnlos.config import save_yaml
-from evnlos.data import Sampling, Simulation
-from evnlos.data.sampling import Samples
-from evnlos.data.store import Dataset, create_dataset, write_shard
+from evnlos.data import Dataset, Samples, Sampling, Simulation, create_dataset, write_shard
 from evnlos.plot.setup import PARTITION, setup_drawing
-from evnlos.report import RunResult, write_report
+from evnlos.report import RunResult, seen_in_training, write_report
 from evnlos.report.pictures import curves_svg
 from evnlos.report.provenance import Commands
 from evnlos.report.sections import _points, _worst, gains_of, setup_section
-from evnlos.report.tables import named, seen_in_training
+from evnlos.report.tables import named
 from evnlos.setups import PaperSetup, RadiometricSetup, lit_setup, named_setup, setup_preset
 
 POSITIONS = 12

@@ -19,12 +19,21 @@ from evnlos.cli import main
 from evnlos.cli.invert_captures import linear_setup
 from evnlos.cli.results import to_text
 from evnlos.config import read_yaml, save_yaml
-from evnlos.data import Capture, CaptureInfo, FixedPattern, Sampling, read_capture, save_pattern
+from evnlos.data import (
+    Capture,
+    CaptureInfo,
+    FixedPattern,
+    Sampling,
+    SensorSize,
+    Simulation,
+    read_capture,
+    save_pattern,
+)
 from evnlos.data.capture_info import CameraInfo
 from evnlos.data.lab import Lab, render_captures
-from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.operators import Gradient, normal_matrix
+from evnlos.inverse import Gradient
+from evnlos.inverse.operators import normal_matrix
 from evnlos.models import SequenceConfig, Weights, published_setup, save_weights
 from evnlos.optics import SlidingWall, View
 from evnlos.plot.results import draw_track

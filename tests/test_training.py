@@ -10,8 +10,7 @@ from evnlos import EvnlosError, evaluate, train
 from evnlos.config import to_dict
 from evnlos.data import NlosDataset
 from evnlos.errors import ConfigError, DataError
-from evnlos.models import ResidualUNet, UNetConfig, load_weights, save_weights
-from evnlos.models.sequence import SequenceConfig
+from evnlos.models import ResidualUNet, SequenceConfig, UNetConfig, load_weights, save_weights
 from evnlos.training import LOSSES, Training, check_run, learning_rate_at, normalized_bce_mse_ssim, paper_loss
 from evnlos.training.source import half_mirrored, with_mirrored
 from evnlos.training.train import validate

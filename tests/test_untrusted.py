@@ -25,7 +25,7 @@ from safetensors.torch import save
 import evnlos
 from evnlos import EvnlosError, read_events
 from evnlos.cameras.video import open_video
-from evnlos.cli.main import main
+from evnlos.cli import main
 from evnlos.data import FixedPattern, Sampling, load_pattern, read_capture, save_pattern
 from evnlos.events import read_triggers
 from evnlos.models import UNetConfig, Weights, load_weights, save_weights

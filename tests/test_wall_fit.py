@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from evnlos.calibration import Calibration, fit_setup, steps_table
-from evnlos.calibration.captures import CaptureSet, grouped, wall_data
+from evnlos.calibration import Calibration, CaptureSet, fit_setup, steps_table
+from evnlos.calibration.captures import grouped, wall_data
 from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
 from evnlos.calibration.wall_search import fit_wall, travelled
-from evnlos.data.capture import Capture
-from evnlos.data.capture_info import CameraInfo, CaptureInfo, MotionInfo, TargetInfo
+from evnlos.data import Capture, CaptureInfo
+from evnlos.data.capture_info import CameraInfo, MotionInfo, TargetInfo
 from evnlos.errors import ConfigError, DataError
 from evnlos.lab import Lobe, Optics, Reflection, cast, fill_throughput
 from evnlos.optics.facets import Pose, SlopeTable
