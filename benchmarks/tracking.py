@@ -4,6 +4,8 @@
     python benchmarks/tracking.py curve      # the paths whose name starts so
     python benchmarks/tracking.py retreat    # from 28 cm to 32 cm, frames alone: error of the distance, mm rms
     python benchmarks/tracking.py coverage   # 40 random paths; also: coverage turn, coverage depth turn
+    python benchmarks/tracking.py coverage camera  # the same with the frame camera's noise in uneven light
+    python benchmarks/tracking.py captures SETUP CAPTURE...  # of captures whose motion is stated
     python benchmarks/tracking.py several 8  # so many pairs of crossing letters, each together and alone
     python benchmarks/tracking.py several 8 cover  # the second letter hides the first where it shines
 
@@ -14,13 +16,15 @@ cent; "frames": without events.
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
-from evnlos.data import CaptureInfo
+from evnlos.cli.invert_captures import linear_setup
+from evnlos.data import CaptureInfo, read_capture
 from evnlos.data.capture import Capture
 from evnlos.data.capture_info import CameraInfo
 from evnlos.errors import EvnlosError
@@ -29,7 +33,7 @@ from evnlos.optics import FilmWall
 from evnlos.scene import Film, HandwritingGlyphs, LineMotion, PathMotion, Scene, SeveralTargets
 from evnlos.scene.handwriting import signed_distance
 from evnlos.setups import RadiometricSetup
-from evnlos.tracking import Tracking, Tracks, track_frames, track_several
+from evnlos.tracking import Tracking, Tracks, track_capture, track_frames, track_several
 from evnlos.types import Events, Irradiance, Plane
 
 SENSOR, SECONDS, FRAMES = (32, 48), 8.0, 21
@@ -99,9 +103,11 @@ def coverage(words: list[str], sequences: int = 40) -> None:
     """Print how often the truth lies in the 90 % intervals of x, y, distance and turn, and the largest errors.
 
     Each sequence has another letter, path and noise (0.4 % of white); 36 x 24 pixels, 21 frames in 8 s, no
-    events. The mean distance is the setup's, as no recording tells it.
+    events. The mean distance is the setup's, as no recording tells it. "camera": noise and fixed pattern of the
+    frame camera, another one each time, and ambient light that falls off by a tenth.
     """
-    setup, glyphs = replace(SETUP, ambient_gradient=(0.0, 0.0)).resized((24, 36)), HandwritingGlyphs()
+    setup = SETUP if "camera" in words else replace(SETUP, ambient_gradient=(0.0, 0.0))
+    setup, glyphs = setup.resized((24, 36)), HandwritingGlyphs()
     times, knots = np.linspace(0.2, 7.8, FRAMES), tuple(np.linspace(0, SECONDS, 5).tolist())
     within, most = [], []
     for seed in range(sequences):
@@ -116,7 +122,11 @@ def coverage(words: list[str], sequences: int = 40) -> None:
         scene = Scene(
             target, PathMotion(knots, points, tuple(away) if "depth" in words else None, turn), SECONDS
         )
-        frames = setup.observe(scene).irradiance(times).numpy() + 4e-3 * draw.standard_normal((FRAMES, 24, 36))
+        wall = setup.observe(scene)
+        if "camera" in words:
+            frames = CAMERA.capture(wall, times, seed=seed) / np.float32(255)
+        else:
+            frames = wall.irradiance(times).numpy() + 4e-3 * draw.standard_normal((FRAMES, 24, 36))
         settings = Tracking(depth="depth" in words, turning="turn" in words)
         track = track_frames(frames, times, None, setup, settings)
         pose = scene.pose(times)
@@ -144,6 +154,21 @@ def coverage(words: list[str], sequences: int = 40) -> None:
         "most",
         np.max(most, axis=0).round(2),
     )
+
+
+def on_captures(word: str, folders: list[str]) -> None:
+    """Print how often the true places lie in the 90 % intervals of x and y, and the errors; without events."""
+    setup, within = linear_setup(Path(word)), []
+    print(f"{'capture':12}  within the 90 % interval x, y   error x, y, mm rms   stated x, y, mm")
+    for folder in folders:
+        capture = read_capture(folder, needs_events=False)
+        assert capture.scene is not None
+        track = track_capture(capture, setup, Tracking(events=False))
+        error, sigma = track.position - capture.scene.light_m(track.time_s), track.position_sigma
+        within.append((np.abs(error) < 1.645 * sigma).mean(axis=0))
+        off, stated = 1e3 * np.sqrt(np.square(error).mean(axis=0)), 1e3 * sigma.mean(axis=0)
+        print(f"{capture.name:12}  {within[-1].round(2)}  {off.round(3)}  {stated.round(3)}", flush=True)
+    print("mean", np.mean(within, axis=0).round(3))
 
 
 def still(setup: RadiometricSetup) -> FilmWall:
@@ -236,6 +261,9 @@ def several(pairs: int, cover: bool) -> None:
 def main() -> None:
     if sys.argv[1:2] == ["several"]:
         several(int((sys.argv[2:3] or ["8"])[0]), "cover" in sys.argv[2:])
+        return
+    if sys.argv[1:2] == ["captures"]:
+        on_captures(sys.argv[2], sys.argv[3:])
         return
     if sys.argv[1:2] == ["coverage"]:
         coverage(sys.argv[2:])

@@ -64,7 +64,7 @@ from evnlos.tracking import (
     track_several,
     track_warnings,
 )
-from evnlos.tracking.motion_fit import Fit, Lights
+from evnlos.tracking.motion_fit import Fit, Lights, moving_energy
 from evnlos.tracking.registration import explained_change
 from evnlos.types import Events, Plane
 
@@ -286,6 +286,25 @@ def test_the_calibrated_operator_finds_the_path() -> None:
     np.testing.assert_allclose(error.mean(axis=0), middle, atol=4e-3)
 
 
+@pytest.mark.parametrize("depth", [False, True])
+def test_ambient_light_that_is_not_quite_known_moves_no_place(depth) -> None:
+    own = SETUP.transport(SHAPE)
+    positions = np.stack([np.linspace(-0.06, 0.06, 7), 0.01 * np.sin(np.arange(7.0))], axis=1)
+    light = SETUP.gain * own(torch.from_numpy(letter().rasterise(own.source, positions))).double()
+    light += 2e-3 * torch.from_numpy(np.random.default_rng(6).standard_normal(light.shape))
+    rest = torch.from_numpy(0.05 * ambient())  # a twentieth of it: what a fit of the ambient light may leave
+    sure, found = (
+        fit_motion(one, SETUP, positions + 0.002, 2e-3, 0.1, 10, depth=depth) for one in (light, light + rest)
+    )
+    moved = np.abs(found.position_m - sure.position_m).max()
+    assert moved < 0.05 * np.sqrt(np.einsum("nknk->nk", sure.covariance)[:, :2]).min()
+    assert found.surprise == pytest.approx(sure.surprise, rel=1e-6)
+    assert moving_energy(light + rest, 2) == pytest.approx(moving_energy(light, 2), rel=1e-9)
+    # Held for known, it passes for a path.
+    off = fit_motion(light + rest, SETUP, positions + 0.002, 2e-3, 0.1, 10, depth=depth, degree=None)
+    assert np.abs(off.position_m - sure.position_m).max() > 20 * moved
+
+
 def retreating(log_distance: np.ndarray, positions: np.ndarray) -> torch.Tensor:
     """Frames of a letter whose distance changes while nothing else of the setup does."""
     source = SETUP.source()
@@ -324,7 +343,7 @@ KINDS = [[0, 1], [0, 1, 2], [0, 1, 3], [0, 1, 2, 3]]
 
 @pytest.fixture(scope="module")
 def lights() -> Lights:
-    return Lights(SETUP, Plane(20, 24, 0.012), SHAPE, depth=True)
+    return Lights(SETUP, Plane(20, 24, 0.012), SHAPE, depth=True, degree=1)
 
 
 @pytest.mark.parametrize("kinds", KINDS)
@@ -338,12 +357,14 @@ def test_the_step_is_that_of_target_and_poses_together(kinds, lights) -> None:
     seen = lights.seen(torch.from_numpy(rng.standard_normal((4, *SHAPE))))
     prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape, dtype=torch.float64))
     image, step, covariance, _ = fit.step(seen, prior)
-    moving = torch.eye(4, dtype=torch.float64) - 0.8 / 4  # one offset a pixel, as large as the noise
     slope = fit.slopes(image.flatten())
     frames, many, parts = slope.shape
+    still = torch.full((parts,), 0.8, dtype=torch.float64)  # one offset a pixel, as large as the noise
+    still[:3] = 1.0  # and any ambient light
+    moving = torch.eye(4, dtype=torch.float64)[..., None] - still / 4
     apart = torch.block_diag(*slope).reshape(frames * many, frames, parts)
     columns = torch.cat([fit.maps.permute(2, 0, 1), apart])  # [unknowns, N, P]
-    weighted = torch.einsum("kl,ulp->ukp", moving, columns).flatten(1)
+    weighted = torch.einsum("klp,ulp->ukp", moving, columns).flatten(1)
     left = seen - fit.maps @ image.flatten()
     square, pull = weighted @ columns.flatten(1).mT, weighted @ left.flatten()
     square[:36, :36] += prior

@@ -158,13 +158,15 @@ def track_several(
     light = torch.from_numpy(small - static_light(small, settings.degree))
     size_m, gains = settings.target_size_m, list[float]()
     if settings.targets == "auto":
-        number = count_targets(light, setup, times_s, noise, size_m, settings.cells)
+        number = count_targets(light, setup, times_s, noise, size_m, settings.cells, degree=settings.degree)
         if not number.found:
             return Tracks((), np.zeros((0, _IMAGE_CELLS, _IMAGE_CELLS)), size_m, tuple(number.gains))
         start_m, gains, bend_m = number.fits[number.found - 1].position_m, number.gains, 0.0
     else:
         start_m, bend_m = first_paths(light, setup, noise, size_m, settings.targets), size_m / 50
-    fit = fit_motion(light, setup, start_m, noise, size_m, settings.cells, bend_m=bend_m)
+    fit = fit_motion(
+        light, setup, start_m, noise, size_m, settings.cells, bend_m=bend_m, degree=settings.degree
+    )
     count, many = fit.covariance.shape[:2]
     values, variance = fit.position_m.reshape(count, many), np.einsum("nknk->nk", fit.covariance)
     blank = np.full(count, np.nan)
@@ -303,7 +305,7 @@ def _in_metres(
     start_m = to_plane(found.place_px)
     fitted = fit_motion(
         light, setup, start_m, noise, settings.target_size_m, settings.cells,
-        depth=settings.depth, turning=settings.turning, image_cells=_IMAGE_CELLS,
+        depth=settings.depth, turning=settings.turning, degree=settings.degree, image_cells=_IMAGE_CELLS,
     )  # fmt: skip
     variance = np.einsum("nknk->nk", fitted.covariance)
     values = np.column_stack(

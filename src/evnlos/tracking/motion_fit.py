@@ -1,9 +1,4 @@
-"""Fitting a motion: positions, and distances and turns where they change, by the calibrated operator.
-
-- Poses that make the frames of one target, or of several, likeliest, by the calibrated operator.
-- How many targets there are, by evidence, and first guesses of their paths.
-- A smoother of poses whose errors belong together.
-"""
+"""Fitting a motion, by the calibrated operator: the likeliest poses of targets, their number, a smoother."""
 
 from __future__ import annotations
 
@@ -16,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.inverse import BackgroundModel
 from evnlos.inverse.operators import Gradient, normal_matrix
 from evnlos.inverse.sequence_problem import mean_weight, strip_of
 from evnlos.machine import note
@@ -25,6 +21,7 @@ from evnlos.setups import Setup
 from evnlos.tracking.track import Measurements, most_likely_acceleration, straightened
 from evnlos.types import Plane
 
+Array = NDArray[np.float64]
 REACH = 0.3
 """Largest change of the distance's logarithm that is looked for: 0.74 to 1.35 of the setup's own distance."""
 REGION = (4.0, 2.8)
@@ -37,8 +34,7 @@ _ROUNDS, _TRIAL_ROUNDS, _STRAIGHT_ROUNDS = 24, 12, 5
 _FIRST_FRAMES = 24  # of which first guesses of paths are made
 _STRIDE = 3  # cells between two of them at most
 _BEND = 0.1  # what a bend of one cell costs, of the brightest score
-_STATIC = 1.0  # a pixel's constant offset over its noise
-_PRIOR = 3.0  # weight of the target's smoothness, in units of the noise's variance
+_STATIC, _PRIOR = 1.0, 3.0  # a pixel's constant offset over its noise; weight of the target's smoothness
 _MARGIN, _STRIP, _LONGEST = 0.3, 0.4, 0.1  # around places, of the strip, of a round: in sides of a target
 _ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
 _WORSE = 2.0  # of one recording's share that its setup gets wrong, over that of all captures held out
@@ -52,27 +48,23 @@ class MotionFit:
 
     Args:
         position_m: Middle of the object's light (x, y), float64 [N, 2], metres.
-        covariance: Of all poses, float64 [N, K, N, K]: of x and y, metres, then, where they were looked for, of
-            ln(distance) and of the turn, radians.
+        covariance: Of x and y, metres, and, where looked for, ln(distance) and turn, radians, [N, K, N, K].
         target: The object, its light's middle in the array's middle, float64 [n, n].
-        log_distance: ln(distance to the wall / the setup's), [N]; its mean is 0, as a target that is nearer and
-            one that is larger and dimmer look much the same. None where it was not looked for.
-        rotation_rad: Turn about the wall's normal, [N]; its mean is 0, as nobody knows which way up the object
-            is. None where it was not looked for.
-        misfit: What the target leaves of the frames' changes, over their noise, root mean square; 1 is a setup
-            that explains all.
-        surprise: Smallest sum of squares of what is left and of the target's roughness, weighed by the prior.
+        log_distance: ln(distance to the wall / the setup's), [N], of mean 0; None where it was not looked for.
+        rotation_rad: Turn about the wall's normal, [N], of mean 0; None where it was not looked for.
+        misfit: What the target leaves of the frames' changes, over their noise, rms; an exact setup leaves 1.
+        surprise: Smallest sum of squares of what is left and of the target's roughness.
         volume: ln of how much the frames narrow down the target, a determinant over that of its prior.
         inside: As `misfit`, of what the strip can show of the frames, where the light is.
         noise: Standard deviation of a sample's noise that was taken for true, white levels.
         size_m: Side of the target's array, metres.
     """
 
-    position_m: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    position_m: Array
+    covariance: Array
     target: torch.Tensor
-    log_distance: NDArray[np.float64] | None = None
-    rotation_rad: NDArray[np.float64] | None = None
+    log_distance: Array | None = None
+    rotation_rad: Array | None = None
     misfit: float = 1.0
     surprise: float = 0.0
     volume: float = 0.0
@@ -84,7 +76,7 @@ class MotionFit:
 def fit_motion(
     light: torch.Tensor,
     setup: Setup,
-    start_m: NDArray[np.float64],
+    start_m: Array,
     noise: float,
     target_size_m: float,
     cells: int = 20,
@@ -93,17 +85,18 @@ def fit_motion(
     turning: bool = False,
     rounds: int = _ROUNDS,
     bend_m: float = 0.0,
+    degree: int | None = 2,
     image_cells: int | None = None,
 ) -> MotionFit:
     """Find the poses of a target, and the target, that explain the frames best: Gauss and Newton's method.
 
     The target is eliminated (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973): a
-    step of the poses knows that the target follows, as it does where a path is stretched or a target comes
-    nearer on its way. A target and a path are only known together up to a shift; the target's middle of light
-    is the reference. Several targets are found together: each knows what the others explain.
+    step of the poses knows that the target follows, as it does where a path is stretched. A target and a path
+    are only known together up to a shift; the target's middle of light is the reference. So are mean distance
+    and turn: a nearer target and a larger one look alike. Each of several knows what the others explain.
 
     Args:
-        light: Frames without ambient light, white levels, [N, h, w].
+        light: Frames, white levels, [N, h, w], without ambient light as far as it is known.
         setup: The setup.
         start_m: First guess of the positions, [N, 2], of K targets [N, K, 2], metres.
         noise: Standard deviation of a sample's noise, white levels.
@@ -114,6 +107,7 @@ def fit_motion(
         rounds: Most steps.
         bend_m: Above 0: standard deviation of a path's second difference in the first rounds, metres, which
             carries it through frames in which another target hides where it is.
+        degree: Ambient light that is left over is any polynomial of this total degree; None: no smooth one.
         image_cells: Cells a side of the target that is returned, solved anew at the poses; None: `cells`.
     """
     target_plane = Plane(cells, cells, target_size_m / cells)
@@ -124,7 +118,8 @@ def fit_motion(
         reach = np.concatenate([reach + 0.21 * target_size_m, reach - 0.21 * target_size_m])
     # Whole steps: recordings alike share their matrices.
     reach = np.stack([np.floor(reach.min(axis=0) / strip_m), np.ceil(reach.max(axis=0) / strip_m)]) * strip_m
-    lights = Lights(setup, strip_of(reach, target_plane), (int(light.shape[1]), int(light.shape[2])), depth)
+    shape = (int(light.shape[1]), int(light.shape[2]))
+    lights = Lights(setup, strip_of(reach, target_plane), shape, depth, degree)
     seen = lights.seen(light)
     count, targets = len(start_m), len(places) // len(start_m)
     prior = torch.block_diag(*[_smooth(target_plane, noise)] * targets)
@@ -161,9 +156,9 @@ def fit_motion(
         target_plane = Plane(image_cells, image_cells, target_size_m / image_cells)
         prior = torch.block_diag(*[_smooth(target_plane, noise)] * targets)
         image = Fit(target_plane, lights, pose, kinds, scale).step(seen, prior)[0]
-    # Pixels that no target reaches hold the noise alone: a setup that explains all leaves just that.
     unit = np.tile(scale[kinds], targets)
-    covariance = (max(told[0], 1.0) * noise) ** 2 * covariance / unit[:, None, None] / unit
+    # An exact setup leaves the noise alone; where the light is, its own noise and the fixed pattern add to it.
+    covariance = (max(told[0], told[3], 1.0) * noise) ** 2 * covariance / unit[:, None, None] / unit
     away, turn = (pose[..., k].reshape(start_m.shape[:-1]) if k in kinds else None for k in (2, 3))
     place, image = pose[..., :2].reshape(start_m.shape), image if start_m.ndim > 2 else image[0]
     return MotionFit(place, covariance, image, away, turn, *told, noise, target_size_m)
@@ -173,14 +168,24 @@ def _smooth(plane: Plane, noise: float) -> torch.Tensor:
     return _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape).double())
 
 
-def moving_energy(frames: torch.Tensor) -> float:
-    """Return the sum of squares of frames [N, ...], with as much of their mean as an unknown offset leaves."""
-    mean = frames.double().mean(dim=0)
-    kept = mean_weight(len(frames), _STATIC)
-    return float(frames.double().square().sum() - (1 - kept) * len(frames) * mean.square().sum())
+def moving_energy(frames: torch.Tensor, degree: int | None = None) -> float:
+    """Return the sum of squares of frames [N, ...], with as much of their mean as an unknown offset leaves.
+
+    With a degree, frames [N, H, W] also lose of their mean what a polynomial of it could be.
+    """
+    mean, kept = frames.double().mean(dim=0), mean_weight(len(frames), _STATIC)
+    known = mean.square().sum()
+    if degree is not None:
+        known -= (_ambient(tuple(mean.shape), degree).mT @ mean.flatten()).square().sum()
+    return float(frames.double().square().sum() - len(frames) * (mean.square().sum() - kept * known))
 
 
-def log_evidence(fit: MotionFit, times_s: NDArray[np.float64], noise: float) -> float:
+def _ambient(shape: tuple[int, ...], degree: int) -> torch.Tensor:
+    """Return polynomials over the pixels, orthonormal, float64 [H W, K]."""
+    return torch.linalg.qr(BackgroundModel(degree).polynomials((shape[0], shape[1])).flatten(1).mT)[0]
+
+
+def log_evidence(fit: MotionFit, times_s: Array, noise: float) -> float:
     """Return ln of the probability density of the frames, up to what all numbers of targets share.
 
     Targets are integrated out exactly, paths by Laplace's method: they may be anywhere in `REGION`, at any
@@ -214,7 +219,7 @@ class Number(NamedTuple):
     """How many targets the frames show, and by how much."""
 
     fits: list[MotionFit]
-    """The likeliest paths and targets of 1, 2, ... targets, one more than were found at most."""
+    """Of 1, 2, ... targets, one more than were found at most."""
     gains: list[float]
     """ln of the evidence of each number over that of one target less and the setup's own error."""
 
@@ -227,11 +232,12 @@ class Number(NamedTuple):
 def count_targets(
     light: torch.Tensor,
     setup: Setup,
-    times_s: NDArray[np.float64],
+    times_s: Array,
     noise: float,
     target_size_m: float,
     cells: int = 20,
     most: int = MOST_TARGETS,
+    degree: int | None = 2,
 ) -> Number:
     """Fit no target, one, two, ..., until one more is less likely: each pays for its paths and cells.
 
@@ -247,14 +253,14 @@ def count_targets(
         target_size_m: Side of a target plane that surely holds an object, metres.
         cells: Cells a side of it.
         most: Largest number that is tried.
+        degree: As for `fit_motion`.
     """
-    found, whole = Number([], []), moving_energy(light)
+    found, whole = Number([], []), moving_energy(light, degree)
     error = max(_WORSE * setup.unexplained, LEAST_ERROR)
     for number in range(1, most + 1):
         start_m = first_paths(light, setup, noise, target_size_m, number)
-        fit = fit_motion(
-            light, setup, start_m, noise, target_size_m, cells, rounds=_TRIAL_ROUNDS, bend_m=target_size_m / 50
-        )
+        bent = {"bend_m": target_size_m / 50, "degree": degree}
+        fit = fit_motion(light, setup, start_m, noise, target_size_m, cells, rounds=_TRIAL_ROUNDS, **bent)
         sigma = noise * max(1.0, fit.inside)  # the fit of more targets tells it where the light is
         fewer = -0.5 * whole / sigma**2
         if found.fits:
@@ -267,9 +273,7 @@ def count_targets(
     return found
 
 
-def first_paths(
-    light: torch.Tensor, setup: Setup, noise: float, target_size_m: float, targets: int
-) -> NDArray[np.float64]:
+def first_paths(light: torch.Tensor, setup: Setup, noise: float, target_size_m: float, targets: int) -> Array:
     """Return first guesses of the paths of targets, [N, K, 2], metres, the brightest first.
 
     Each frame becomes an image of the target's plane (Tikhonov), blurred to a target's width. A path is the
@@ -306,7 +310,7 @@ def first_paths(
     return np.stack(paths, axis=1)
 
 
-def _brightest_path(score: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _brightest_path(score: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return rows and columns [T] of the path of the largest sum of scores [T, H, W] less its bends.
 
     Viterbi's algorithm; a state is a cell and the step to it, of at most `_STRIDE` cells along each axis.
@@ -316,11 +320,8 @@ def _brightest_path(score: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDAr
     came = np.zeros((len(score), side, side, height, width), np.int8)
     for t in range(1, len(score)):
         around = np.pad(best, ((1, 1), (1, 1), (0, 0), (0, 0)), constant_values=-np.inf)
-        options = [
-            around[a : a + side, b : b + side] - _BEND * ((a - 1) ** 2 + (b - 1) ** 2)
-            for a in range(3)
-            for b in range(3)
-        ]
+        bends = [(a, b, _BEND * ((a - 1) ** 2 + (b - 1) ** 2)) for a in range(3) for b in range(3)]
+        options = [around[a : a + side, b : b + side] - bend for a, b, bend in bends]
         before = np.argmax(options, axis=0)
         margin = ((0, 0), (0, 0), (_STRIDE,) * 2, (_STRIDE,) * 2)
         top = np.pad(np.max(options, axis=0), margin, constant_values=-np.inf)
@@ -345,16 +346,20 @@ def _brightest_path(score: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDAr
 class Lights:
     """What cells of a strip make of the camera's image, as splines over the strip, at any distance.
 
-    Images are told by their parts P in a basis of all that the strip can show, which leaves noise white.
+    Images are told by their parts P in a basis of all that the strip can show, which leaves noise white; the
+    first `ambient` of them are what ambient light could be, too.
 
     Args:
         setup: The setup.
         strip: Cells of the target's plane.
         shape: Size (H, W) of the images, pixels.
         depth: Whether other distances than the setup's are asked for.
+        degree: Total degree of the ambient light; None: there is none.
     """
 
-    def __init__(self, setup: Setup, strip: Plane, shape: tuple[int, int], depth: bool) -> None:
+    def __init__(
+        self, setup: Setup, strip: Plane, shape: tuple[int, int], depth: bool, degree: int | None = None
+    ) -> None:
         self.strip, setup = strip, setup.seen_by(shape)
         self._own_m = setup.default_distance_m or 1.0
         if depth:
@@ -363,9 +368,14 @@ class Lights:
         else:
             own = setup.operator(strip, shape).dense()
             away = DepthTransport(lambda _: own, 0.99 * self._own_m, 1.01 * self._own_m, strip, shape)
-        self._basis, self._away = away.basis.double(), copy(away)
+        own = away.basis.double()
+        smooth = own[:, :0] if degree is None else _ambient(shape, degree)
+        self._basis = torch.linalg.qr(torch.cat([smooth, own], dim=1))[0]
+        self._away, self.ambient = copy(away), smooth.shape[1]
         self._known: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}
-        planes = (one.double().unflatten(-1, strip.shape) for one in away.nodes)  # all at once take gigabytes
+        turn = self._basis.mT @ own
+        # All at once take gigabytes.
+        planes = ((turn @ one.double()).unflatten(-1, strip.shape) for one in away.nodes)
         self._away.nodes = torch.stack([spline_coefficients(one).flatten(-2).float() for one in planes])
 
     def seen(self, light: torch.Tensor) -> torch.Tensor:
@@ -376,14 +386,11 @@ class Lights:
         """Return splines over the strip, [P, cells], and their derivative by ln(distance)."""
         if log_distance not in self._known:
             self._known.clear()  # poses in a plane ask for the same one again
-            distance_m = self._own_m * math.exp(log_distance)
-            away = self._away
+            away, distance_m = self._away, self._own_m * math.exp(log_distance)
             self._known[log_distance] = away.coefficients(distance_m).double(), away.slope(distance_m).double()
         return self._known[log_distance]
 
-    def taps(
-        self, plane: Plane, pose: NDArray[np.float64]
-    ) -> tuple[torch.Tensor, torch.Tensor, dict[int, torch.Tensor]]:
+    def taps(self, plane: Plane, pose: Array) -> tuple[torch.Tensor, torch.Tensor, dict[int, torch.Tensor]]:
         """Return which splines the cells of a target in a pose take, and how much of each.
 
         Args:
@@ -391,17 +398,15 @@ class Lights:
             pose: x, y, ln(distance), turn.
 
         Returns:
-            Places in the flattened strip [16, n], weights [16, n], and their derivatives by x, y, a metre,
-            and the turn, a radian.
+            Places in the flattened strip [16, n], weights [16, n], their derivatives by x, y and turn (SI).
         """
         x, y = (torch.from_numpy(one) for one in np.meshgrid(plane.x_m, plane.y_m))
         cos, sin = math.cos(pose[3]), math.sin(pose[3])
         right, down = (cos * x - sin * y).flatten(), (sin * x + cos * y).flatten()
-        pitch = self.strip.pitch_m
+        pitch, (h, w) = self.strip.pitch_m, self.strip.shape
         column = (right + pose[0] - float(self.strip.x_m[0])) / pitch
         row = (down + pose[1] - float(self.strip.y_m[0])) / pitch
         (left, wx, dx), (top, wy, dy) = (_spline_taps(one) for one in (column, row))
-        h, w = self.strip.shape
         index = (top[:, None] % h) * w + left[None, :] % w  # beyond the strip there is no target
         share = plane.pitch_m**2 / pitch**2
         weights = share * wy[:, None] * wx[None]
@@ -424,17 +429,11 @@ class Fit:
         target_plane: The target plane's cells.
         lights: The light of the strip's cells.
         poses: x, y (metres), ln(distance), turn (radians) of each frame, [N, 4]; of K targets [N, K, 4].
-        kinds: Which of them are looked for.
-        scale: Metres per unit of each.
+        kinds: Which of them are looked for; `scale` is the metres per unit of each.
     """
 
     def __init__(
-        self,
-        target_plane: Plane,
-        lights: Lights,
-        poses: NDArray[np.float64],
-        kinds: list[int],
-        scale: NDArray[np.float64],
+        self, target_plane: Plane, lights: Lights, poses: Array, kinds: list[int], scale: Array
     ) -> None:
         self.target_plane, self._scale = target_plane, scale
         self._found = (*poses.shape[1:-1], *target_plane.shape)
@@ -449,12 +448,13 @@ class Fit:
             maps.append(torch.cat(own, dim=1))
         self.maps = torch.stack(maps)  # [N, P, K n n]
         self._total = self.maps.sum(dim=0)
-        self._still = (1 - mean_weight(len(poses), _STATIC)) / len(poses)
+        # What an unknown offset of each pixel takes off the mean of each part; ambient light takes all of it.
+        share = torch.ones(self.maps.shape[1], dtype=torch.float64) / len(poses)
+        self._still = (1 - mean_weight(len(poses), _STATIC)) * share
+        self._still[: lights.ambient] = 1 / len(poses)
         self.surprise = self.volume = 0.0  # of the state of `step`, for `log_evidence`
 
-    def step(
-        self, seen: torch.Tensor, prior: torch.Tensor
-    ) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.float64], float]:
+    def step(self, seen: torch.Tensor, prior: torch.Tensor) -> tuple[torch.Tensor, Array, Array, float]:
         """Return target, step of all poses [N, K], metres, their covariance [N, K, N, K], and what is left.
 
         The covariance is that of noise of variance 1; what is left is the sum of squares of the frames' changes
@@ -465,7 +465,7 @@ class Fit:
             prior: Matrix of the prior of all targets, [K n n, K n n].
         """
         normal = prior + torch.einsum("npc,npd->cd", self.maps, self.maps)
-        normal -= self._still * self._total.mT @ self._total
+        normal -= (self._still * self._total.mT) @ self._total
         # The light's middle lies in the target's: only then is a place the light's middle.
         x, y = np.meshgrid(self.target_plane.x_m, self.target_plane.y_m)
         middle = torch.from_numpy(np.stack([x.ravel(), y.ravel()])) / self.target_plane.extent_m[0]
@@ -486,10 +486,10 @@ class Fit:
         even = torch.linalg.solve_triangular(lower, slope, upper=False)
         pull = (even @ self._moving(left)[..., None]).flatten()
         flat = even.flatten(0, 1)  # [N K, P]
-        back = (even @ self.maps).flatten(0, 1) - self._still * flat @ self._total  # [N K, n n]
+        back = (even @ self.maps).flatten(0, 1) - (self._still * flat) @ self._total  # [N K, n n]
         shared = torch.linalg.solve_triangular(root, back.mT, upper=False)
         one = torch.eye(len(flat), dtype=flat.dtype)
-        told = one - self._still * flat @ flat.mT - shared.mT @ shared
+        told = one - (self._still * flat) @ flat.mT - shared.mT @ shared
         # A distance or a turn that is the same in all frames is the target's own: it is left out.
         own = torch.zeros(frames, kinds, kinds, dtype=flat.dtype)
         for k, kind in enumerate(self._kinds):
@@ -526,13 +526,13 @@ class Fit:
 
 
 def smooth_together(
-    times_s: NDArray[np.float64],
-    values: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    rates: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None],
+    times_s: Array,
+    values: Array,
+    covariance: Array,
+    rates: list[tuple[Array, Array, Array] | None],
     accelerations: list[float],
-    at_s: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    at_s: Array,
+) -> tuple[Array, Array]:
     """Return values and rates at any instants given values whose errors belong together: the exact posterior.
 
     The prior of each kind is that of `smooth`, of unknown beginnings. Poses that one target ties together err
@@ -589,7 +589,7 @@ def smooth_together(
     return mean, sigma
 
 
-def _walk(t: NDArray[np.float64], is_rate: NDArray[np.bool_], acceleration: float) -> NDArray[np.float64]:
+def _walk(t: Array, is_rate: NDArray[np.bool_], acceleration: float) -> Array:
     """Return the covariance of values and rates at instants t >= 0, both 0 at 0; the rate walks at random."""
     s, r = t[:, None], t[None, :]
     low = np.minimum(s, r)
