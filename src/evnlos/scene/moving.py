@@ -137,7 +137,8 @@ class LineMotion:
         if self.retreat_m_s or self.spin_deg_s:
             raise DataError(
                 f"the motion retreats at {self.retreat_m_s:g} m/s and turns at {self.spin_deg_s:g} degrees/s, "
-                "and this knows one plane and an upright target; follow it (`evnlos track --depth --turning`)"
+                "and this knows one plane and an upright target; follow it, which writes its image, too "
+                "(`evnlos track --depth --turning`)"
             )
         return self
 
