@@ -9,12 +9,15 @@ import pytest
 from PIL import Image
 
 from evnlos import config, doctor
+from evnlos.cli import main
+from evnlos.data import read_capture
 from evnlos.errors import ConfigError, DataError, EvnlosError, MissingDependencyError
 from evnlos.scene import (
     EmnistGlyphs,
     FontGlyphs,
     HandwritingGlyphs,
     NistGlyphs,
+    PictureGlyphs,
     TargetPlane,
     character_name,
     find_font,
@@ -360,3 +363,60 @@ def test_sets_round_trip_through_a_settings_file(tmp_path):
 def test_bad_settings_are_refused(build):
     with pytest.raises(EvnlosError):
         build()
+
+
+def test_pictures_of_any_size_and_depth_are_targets(tmp_path):
+    ramp = np.tile(np.linspace(0, 255, 120).astype(np.uint8), (60, 1))
+    Image.fromarray(ramp).save(tmp_path / "ramp.png")
+    Image.fromarray(ramp.astype(np.uint16) * 257).save(tmp_path / "deep one.png")
+    clear = np.zeros((5, 5, 4), np.uint8)
+    clear[..., :3], clear[2, 2, 3] = 255, 255  # white, but transparent around its middle
+    Image.fromarray(clear).save(tmp_path / "clear.png")
+    (tmp_path / "notes.txt").write_text("no picture")
+    glyphs = PictureGlyphs(folder=str(tmp_path), target_plane=TargetPlane(size_m=0.8, size_px=40))
+    assert glyphs.objects() == ["clear", "deep_one", "ramp"]
+    mask = glyphs.target("ramp").mask
+    assert mask.shape == (40, 40) and glyphs.target("ramp").size_m == 0.8
+    assert not mask[:10].any() and not mask[30:].any()  # as wide as the target, half as high
+    np.testing.assert_allclose(mask[10:30].mean(axis=0), (np.arange(40) + 0.5) / 40, atol=0.01)
+    np.testing.assert_allclose(glyphs.target("deep_one").mask, mask, atol=0.01)
+    assert glyphs.target("clear").mask.sum() == pytest.approx(64, rel=0.05)  # 1 of 25 parts
+
+
+def test_pictures_that_cannot_be_targets_are_named(tmp_path):
+    def of(folder):
+        return PictureGlyphs(folder=str(folder))
+
+    with pytest.raises(ConfigError, match="is no folder"):
+        of(tmp_path / "nowhere").objects()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="holds no pictures"):
+        of(tmp_path / "empty").objects()
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n torn")
+    Image.new("L", (9, 9)).save(tmp_path / "bad" / "night.png")
+    Image.new("F", (9, 9), 0.5).save(tmp_path / "bad" / "float.tif")
+    for name, reason in (("torn", "torn.png"), ("night", "is black"), ("float", "floating-point")):
+        with pytest.raises(DataError, match=reason):
+            of(tmp_path / "bad").target(name)
+    (tmp_path / "twice").mkdir()
+    for name in ("a.png", "A.gif"):
+        Image.new("L", (9, 9), 200).save(tmp_path / "twice" / name)
+    with pytest.raises(ConfigError, match="rename one of them"):
+        of(tmp_path / "twice").objects()
+
+
+def test_the_commands_take_pictures_by_one_flag(tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    Image.new("L", (30, 20), 200).save(tmp_path / "mine" / "slab.png")
+    size = ["--setup.sensor.height", "24", "--setup.sensor.width", "36", "--duration-s", "0.6"]
+    main(["lab", "--out", str(tmp_path / "out"), "--pictures", str(tmp_path / "mine"), *size])
+    target = read_capture(tmp_path / "out" / "lab_slab").target
+    assert target is not None and 0 < target.mask.mean() < 0.6
+    main(["simulate", "--out", str(tmp_path / "data"), "--pictures", str(tmp_path / "mine"), "--dry-run"])
+    capsys.readouterr()
+    for word, reason in (("nowhere", "is no folder"), ("out", "holds no pictures")):
+        for verb in ("lab", "simulate"):
+            with pytest.raises(SystemExit):
+                main([verb, "--out", str(tmp_path / verb), "--pictures", str(tmp_path / word)])
+            assert reason in capsys.readouterr().err

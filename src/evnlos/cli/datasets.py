@@ -1,8 +1,4 @@
-"""Commands that make and check data: `simulate`, `lab`, `capture`, `import`.
-
-- `evnlos simulate`: config in, dataset of shards out. `evnlos lab`: a setup in, pseudo-real captures out.
-- `evnlos capture`: begin a capture folder, and check it. `evnlos import`: such folders in, a dataset out.
-"""
+"""Commands that make and check data: `simulate`, `lab`, `capture`, `import`."""
 
 from __future__ import annotations
 
@@ -37,7 +33,7 @@ from evnlos.data.capture_info import CAMERAS, CaptureInfo, begin_capture
 from evnlos.data.lab import Lab, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
 from evnlos.data.sampling import split_of
-from evnlos.data.simulations import PRESETS, estimate
+from evnlos.data.simulations import PRESETS, estimate, with_pictures
 from evnlos.errors import ConfigError, DataError, EvnlosError, UnknownNameError
 from evnlos.files import check_folder, write_atomically
 from evnlos.machine import ProgressBars, counted
@@ -68,6 +64,8 @@ class SimulateCommand:
     pixel: str | None = None
     """The event pixel instead of the setup's: a preset's name, or a YAML file, as `evnlos pixel fit`
     writes it."""
+    pictures: Path | None = None
+    """Folder with pictures of yours in place of the characters: each a target, of any size, taken in grey."""
     robust: bool = False
     """Draw sensors and walls from wide ranges around those of the settings: for setups that change."""
     workers: int = 0
@@ -106,6 +104,8 @@ class SimulateCommand:
         setup = replace(settings.setup, pixel=load_pixel(word))
         vary = {path: ends for path, ends in settings.vary.items() if not path.startswith("setup.pixel")}
         return replace(settings, setup=setup, vary=vary)
+
+    with_pictures = staticmethod(with_pictures)
 
     def run(self) -> None:
         """Simulate, with a progress bar over the objects."""
@@ -160,6 +160,8 @@ class LabCommand:
     is compared with them. Beside it only --glyphs.characters counts."""
     config: Path | None = None
     """YAML file with settings of the laboratory."""
+    pictures: Path | None = None
+    """Folder with pictures of yours in place of the characters: each a target, of any size, taken in grey."""
     workers: int = 1
     """Processes; 0 = one for each core. The captures are the same for any number."""
     force: bool = False
@@ -170,6 +172,8 @@ class LabCommand:
     def with_setup(settings: Lab, word: str) -> Lab:
         """Return the lab with the setup of `--setup`."""
         return lab_of(word, settings)
+
+    with_pictures = staticmethod(with_pictures)
 
     def run(self) -> None:
         """Render, with a progress bar over the captures; compare a published set with its checksums."""
@@ -372,18 +376,12 @@ class ImportCommand:
     def run(self) -> None:
         """Import, with a progress bar over the captures."""
         with ProgressBars() as progress:
+            pattern = load_pattern(self.pattern) if self.pattern else None
             dataset = import_captures(
-                self.captures,
-                self.out,
-                self.sampling,
-                test=self.test,
-                validation=self.validation,
-                pattern=load_pattern(self.pattern) if self.pattern else None,
-                events_topic=self.topic,
-                frames_topic=self.frames_topic,
-                look=self._look,
+                self.captures, self.out, self.sampling, test=self.test, validation=self.validation,
+                pattern=pattern, events_topic=self.topic, frames_topic=self.frames_topic, look=self._look,
                 progress=progress,
-            )
+            )  # fmt: skip
         counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
         about = {"out": str(self.out), "split": dataset.split}
         result(self.json, about, f"{self.out}: {_counted(len(dataset.objects()))} ({counts})")

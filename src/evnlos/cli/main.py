@@ -296,7 +296,9 @@ def _check_kinds(settings: Any, words: list[str], prefix: str = "--") -> None:
             _check_kinds(here, words, f"{flag}.")
 
 
-_DECIDES = re.compile(r"--(config|setup|pixel|[\w.-]+\.kind)(=|$)")  # what decides which flags there are
+_DECIDES = re.compile(
+    r"--(config|setup|pixel|pictures|[\w.-]+\.kind)(=|$)"
+)  # what decides which flags there are
 
 
 def _command(verb: str, rest: list[str]) -> Any:
@@ -317,7 +319,7 @@ def _command(verb: str, rest: list[str]) -> Any:
 
 
 def _defaults(command: type[Any], rest: list[str]) -> Any:
-    """Return the command with what --preset, --config, --setup and --pixel name as defaults of the flags."""
+    """Return the command with what --preset, --config, --setup, --pixel and --pictures name as defaults."""
     if not hasattr(command, "PRESETS"):
         return None
     import tyro
@@ -327,12 +329,10 @@ def _defaults(command: type[Any], rest: list[str]) -> Any:
     settings, config = _preset(command, rest), flag_value(rest, "--config")
     if config is not None:
         settings = load_yaml(type(settings), config)
-    word = flag_value(rest, "--setup")
-    if word is not None and hasattr(command, "with_setup"):
-        settings = command.with_setup(settings, word)
-    word = flag_value(rest, "--pixel")
-    if word is not None and hasattr(command, "with_pixel"):
-        settings = command.with_pixel(settings, word)
+    for name in ("setup", "pixel", "pictures"):
+        word = flag_value(rest, f"--{name}")
+        if word is not None and hasattr(command, f"with_{name}"):
+            settings = getattr(command, f"with_{name}")(settings, word)
     settings = _of_kinds(settings, rest)
     required = {
         item.name: tyro.MISSING

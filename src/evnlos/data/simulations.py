@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 from evnlos.config import config_hash, from_dict
 from evnlos.data.pool import processes
@@ -23,10 +24,28 @@ from evnlos.data.simulate import Simulation, needs_a_matrix, ranges_around, simu
 from evnlos.data.store import PAGE, Dataset, claim_dataset, is_page_changed, read_shard, write_shard
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, Step, silent
-from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs, LineMotion
+from evnlos.scene import (
+    DIGITS,
+    TRAIN_WRITERS,
+    UPPER_CASE,
+    FontGlyphs,
+    HandwritingGlyphs,
+    LineMotion,
+    PictureGlyphs,
+)
 from evnlos.setups.load import page_setup
 from evnlos.setups.paper import as_in_the_paper, rough_paper
 from evnlos.types import target_side_m
+
+if TYPE_CHECKING:
+    from evnlos.data.lab import Lab
+
+S = TypeVar("S", Simulation, "Lab")
+
+
+def with_pictures(settings: S, folder: str) -> S:
+    """Return settings whose objects are the pictures of a folder, on a target as large as it was."""
+    return replace(settings, glyphs=PictureGlyphs(folder=folder, target_plane=settings.glyphs.target_plane))
 
 
 def default() -> Simulation:

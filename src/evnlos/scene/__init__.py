@@ -1,6 +1,15 @@
 """What is hidden and how it moves."""
 
-from evnlos.scene.databases import Handwritten, list_emnist, list_sd19, read_emnist, read_sd19
+from evnlos.scene.databases import (
+    Handwritten,
+    ObjectId,
+    TargetPlane,
+    list_emnist,
+    list_sd19,
+    read_emnist,
+    read_picture,
+    read_sd19,
+)
 from evnlos.scene.drawings import Film, closing_hand, drawing
 from evnlos.scene.fonts import (
     DIGITS,
@@ -19,9 +28,8 @@ from evnlos.scene.glyph_sets import (
     GlyphSet,
     HandwritingGlyphs,
     NistGlyphs,
-    ObjectId,
     OtherTarget,
-    TargetPlane,
+    PictureGlyphs,
     with_others,
 )
 from evnlos.scene.handwriting import (
@@ -58,6 +66,7 @@ __all__ = [
     "ObjectId",
     "OtherTarget",
     "PathMotion",
+    "PictureGlyphs",
     "Pose",
     "Scene",
     "SeveralTargets",
@@ -76,6 +85,7 @@ __all__ = [
     "nist_like",
     "pen_width",
     "read_emnist",
+    "read_picture",
     "read_sd19",
     "redrawn",
     "render_glyph",

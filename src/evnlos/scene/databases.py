@@ -1,4 +1,4 @@
-"""Databases of handwriting that a user has a copy of: NIST Special Database 19 and EMNIST.
+"""Images that a user has: pictures in a folder, NIST Special Database 19, EMNIST.
 
 Read the user's own copy of NIST Special Database 19, in its official layout "by_class".
 
@@ -19,17 +19,23 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.errors import DataError
-from evnlos.scene.fonts import DIGITS, UPPER_CASE
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene.fonts import DIGITS, UPPER_CASE, check_size
 from evnlos.untrusted import open_image
 
+ObjectId: TypeAlias = str
+"""Name of an object, e.g. "writer03_A": unique, stable, and a file name on any file system."""
 _MAX_SIDE = 1024  # the official images have 128 pixels per side
+_PICTURES = (".png", ".jpg", ".jpeg", ".gif", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+_DARK = 1 / 255  # below it a picture is black
 
 
 class Handwritten(NamedTuple):
@@ -281,3 +287,95 @@ def _read_exactly(stream: gzip.GzipFile, size: int, path: Path) -> NDArray[np.ui
     if len(content) < size:
         raise DataError(f"{path} ends early: {len(content)} of {size} bytes; restore it from the database")
     return np.frombuffer(content, dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class TargetPlane:
+    """The square that carries a character.
+
+    Args:
+        size_m: Side of the target plane, metres.
+        size_px: Side of the mask, pixels.
+        letter_fraction: Longer side of a letter as a part of the target plane's side, 0..1.
+        digit_fraction: The same of a digit; smaller, as in the paper.
+    """
+
+    size_m: float = 0.08
+    size_px: int = 256
+    letter_fraction: float = 1.0
+    digit_fraction: float = 0.75
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.size_m) and self.size_m > 0):
+            raise ConfigError(f"size_m is {self.size_m}; give a positive number of metres")
+        for fraction in (self.letter_fraction, self.digit_fraction):
+            check_size(self.size_px, fraction)
+
+    def fraction(self, char: str) -> float:
+        """Return the part of the target plane's side that this character fills."""
+        return self.digit_fraction if char in DIGITS else self.letter_fraction
+
+
+def look_up(index: dict, object_id: ObjectId):
+    """Return what an index knows of an object; refuse a name that is not in it."""
+    if object_id not in index:
+        raise ConfigError(
+            f"{object_id!r} is not among the {len(index)} objects of this set; take a name it lists"
+        )
+    return index[object_id]
+
+
+@lru_cache(maxsize=16)
+def list_pictures(folder: str) -> dict[ObjectId, Path]:
+    """Return the pictures of a folder by the names of their objects, in alphabetical order."""
+    if not Path(folder).is_dir():
+        raise ConfigError(f"{folder} is no folder; name the one that holds the pictures (glyphs.folder)")
+    files = [path for path in sorted(Path(folder).iterdir()) if path.suffix.lower() in _PICTURES]
+    if not files:
+        raise ConfigError(f"{folder} holds no pictures; put images NAME.png, one an object, into it")
+    found: dict[ObjectId, Path] = {}
+    for path in files:
+        name = re.sub(r"[^\w-]+", "_", path.stem)
+        if name.lower() in map(str.lower, found):  # as folders of captures they would be one
+            raise ConfigError(f"{path}: another picture is called {name}, too; rename one of them")
+        found[name] = path
+    return found
+
+
+def read_picture(path: Path, size_px: int = 256, fraction: float = 1.0) -> NDArray[np.float32]:
+    """Return a picture in grey in the middle of a dark square, float32 [size_px, size_px], 0..1.
+
+    Args:
+        path: An image file of any size.
+        size_px: Side of the square, pixels, 8 to 2048.
+        fraction: The picture's longer side as a part of the square's, above 0 to 1.
+
+    Raises:
+        DataError: The file can't be read, or is black.
+    """
+    from PIL import Image
+
+    check_size(size_px, fraction)
+    try:
+        with open_image(path) as image:
+            if image.mode == "F":
+                raise OSError("its values are floating-point numbers, of no known white")
+            if image.mode.startswith("I"):  # 16 bits: `convert` would clip them
+                grey = np.asarray(image, np.float32) / 65535
+            else:
+                full = image.convert("RGBA")
+                grey = np.asarray(
+                    Image.alpha_composite(Image.new("RGBA", full.size, "black"), full).convert("L")
+                )
+                grey = grey.astype(np.float32) / 255
+    except OSError as error:
+        raise DataError(f"{path}: {error}; give an image file that can be opened, or take it away") from None
+    if not grey.max() > _DARK:
+        raise DataError(f"{path} is black, and black gives no light; draw bright on dark, or take it away")
+    side = max(grey.shape) / fraction
+    wide, high = (max(1, round(n / side * size_px)) for n in grey.shape[::-1])
+    how = Image.Resampling.BOX if side > size_px else Image.Resampling.BILINEAR
+    small = Image.fromarray(grey).resize((wide, high), how)
+    mask, top, left = np.zeros((size_px, size_px), np.float32), (size_px - high) // 2, (size_px - wide) // 2
+    mask[top : top + high, left : left + wide] = np.clip(np.asarray(small), 0, 1)
+    return mask

@@ -1,7 +1,4 @@
-"""Which objects a data set is made of: settings that list objects by name and make the target of each.
-
-- Drawings as a set of objects: what a network that learned characters has never seen.
-"""
+"""Which objects a data set is made of: settings that list objects by name and make the target of each."""
 
 from __future__ import annotations
 
@@ -16,7 +13,17 @@ from numpy.typing import NDArray
 
 from evnlos.config import BESIDE
 from evnlos.errors import ConfigError
-from evnlos.scene.databases import list_emnist, list_sd19, read_emnist_images, read_sd19_image
+from evnlos.scene.databases import (
+    ObjectId,
+    TargetPlane,
+    list_emnist,
+    list_pictures,
+    list_sd19,
+    look_up,
+    read_emnist_images,
+    read_picture,
+    read_sd19_image,
+)
 from evnlos.scene.drawings import KINDS, drawing
 from evnlos.scene.fonts import (
     DIGITS,
@@ -24,7 +31,6 @@ from evnlos.scene.fonts import (
     UPPER_CASE,
     Font,
     character_name,
-    check_size,
     find_font,
     fit_to_target_plane,
     render_glyph,
@@ -32,9 +38,6 @@ from evnlos.scene.fonts import (
 from evnlos.scene.handwriting import Strokes, nist_like, redrawn
 from evnlos.scene.moving import LineMotion, Scene, SeveralTargets, Target
 from evnlos.untrusted import open_image
-
-ObjectId: TypeAlias = str
-"""Name of an object, e.g. "writer03_A": unique, stable, and a file name on any file system."""
 
 
 class GlyphSet(Protocol):
@@ -51,33 +54,6 @@ class GlyphSet(Protocol):
     def notes(self) -> list[str]:
         """Return lines that the user should see, e.g. which font stands in for which."""
         ...
-
-
-@dataclass(frozen=True)
-class TargetPlane:
-    """The square that carries a character.
-
-    Args:
-        size_m: Side of the target plane, metres.
-        size_px: Side of the mask, pixels.
-        letter_fraction: Longer side of a letter as a part of the target plane's side, 0..1.
-        digit_fraction: The same of a digit; smaller, as in the paper.
-    """
-
-    size_m: float = 0.08
-    size_px: int = 256
-    letter_fraction: float = 1.0
-    digit_fraction: float = 0.75
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.size_m) and self.size_m > 0):
-            raise ConfigError(f"size_m is {self.size_m}; give a positive number of metres")
-        for fraction in (self.letter_fraction, self.digit_fraction):
-            check_size(self.size_px, fraction)
-
-    def fraction(self, char: str) -> float:
-        """Return the part of the target plane's side that this character fills."""
-        return self.digit_fraction if char in DIGITS else self.letter_fraction
 
 
 @dataclass(frozen=True)
@@ -126,9 +102,9 @@ class HandwritingGlyphs:
         """Return one writer's character; the seed fixes the population of writers."""
         hand, _, name = object_id.partition("_")
         if self.redrawn and hand.startswith("redrawn"):
-            drawing = _look_up(_known_targets(self.known), name)
+            drawing = look_up(_known_targets(self.known), name)
             return Target(object_id, redrawn(drawing, name, int(hand[7:]), seed), self.target_plane.size_m)
-        writer, char = _look_up(_handwriting_index(self), object_id)
+        writer, char = look_up(_handwriting_index(self), object_id)
         plane = self.target_plane
         mask = nist_like(writer, char, seed, plane.size_px, plane.fraction(char), self.strokes, self.centre)
         return Target(object_id, mask, self.target_plane.size_m)
@@ -167,7 +143,7 @@ class FontGlyphs:
 
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one character; the seed has no part in it."""
-        char = _look_up(_font_index(self), object_id)
+        char = look_up(_font_index(self), object_id)
         mask = render_glyph(char, self.font(), self.target_plane.size_px, self.target_plane.fraction(char))
         return Target(object_id, mask, self.target_plane.size_m)
 
@@ -209,7 +185,7 @@ class NistGlyphs:
 
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one scanned character, cut to its ink and centred; the seed has no part in it."""
-        char, path = _look_up(_nist_index(self), object_id)
+        char, path = look_up(_nist_index(self), object_id)
         mask = fit_to_target_plane(
             read_sd19_image(path), self.target_plane.size_px, self.target_plane.fraction(char)
         )
@@ -254,7 +230,7 @@ class EmnistGlyphs:
 
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one character, cut to its ink, enlarged and centred; the seed has no part in it."""
-        char, number = _look_up(_emnist_index(self), object_id)
+        char, number = look_up(_emnist_index(self), object_id)
         mask = fit_to_target_plane(
             _emnist_images(self)[number], self.target_plane.size_px, self.target_plane.fraction(char)
         )
@@ -316,14 +292,6 @@ def _emnist_images(glyphs: EmnistGlyphs) -> dict[int, NDArray[np.float32]]:
     return dict(read_emnist_images(glyphs.folder, numbers, glyphs.subset, glyphs.part))
 
 
-def _look_up(index: dict, object_id: ObjectId):
-    if object_id not in index:
-        raise ConfigError(
-            f"{object_id!r} is not among the {len(index)} objects of this set; take a name it lists"
-        )
-    return index[object_id]
-
-
 def _check_characters(characters: str) -> None:
     if not characters or len(set(characters)) < len(characters) or any(c.isspace() for c in characters):
         raise ConfigError(f"characters is {characters!r}; give each character once, and no spaces")
@@ -377,7 +345,38 @@ class DrawingGlyphs:
         return []
 
 
-Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs
+@dataclass(frozen=True)
+class PictureGlyphs:
+    """The user's own pictures: each image of a folder is an object, of any size, taken in grey.
+
+    White shines, black is dark, values between are shares of light; transparent pixels are black. The longer
+    side fills the target plane, what is left of it is dark.
+
+    Args:
+        kind: Names this kind of set in a settings file.
+        folder: Folder with the images, NAME.png and so on.
+        target_plane: What carries a picture; `letter_fraction` is the part of it that the longer side fills.
+    """
+
+    kind: Literal["pictures"] = "pictures"
+    folder: str = "pictures"
+    target_plane: TargetPlane = field(default_factory=TargetPlane)
+
+    def objects(self) -> list[ObjectId]:
+        """Return the names of all objects, those of the files in alphabetical order."""
+        return list(list_pictures(self.folder))
+
+    def target(self, object_id: ObjectId, seed: int = 0) -> Target:
+        """Return one picture, as `read_picture` does; the seed has no part in it."""
+        path, plane = look_up(list_pictures(self.folder), object_id), self.target_plane
+        return Target(object_id, read_picture(path, plane.size_px, plane.letter_fraction), plane.size_m)
+
+    def notes(self) -> list[str]:
+        """Return nothing: the pictures are what their names say."""
+        return []
+
+
+Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs | PictureGlyphs
 """All kinds of sets, distinguished by `kind` in a settings file."""
 
 
