@@ -6,6 +6,7 @@
     python benchmarks/tracking.py coverage   # 40 random paths; also: coverage turn, coverage depth turn
     python benchmarks/tracking.py coverage camera  # the same with the frame camera's noise in uneven light
     python benchmarks/tracking.py captures SETUP CAPTURE...  # of captures whose motion is stated
+    python benchmarks/tracking.py images 12  # so many sequences; motion known, found, ignored; also: 12 depth
     python benchmarks/tracking.py several 8  # so many pairs of crossing letters, each together and alone
     python benchmarks/tracking.py several 8 cover  # the second letter hides the first where it shines
 
@@ -15,6 +16,7 @@ cent; "frames": without events.
 """
 
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,21 +24,36 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.analysis import track_psnr
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli.invert_captures import linear_setup
 from evnlos.data import CaptureInfo, read_capture
 from evnlos.data.capture import Capture
 from evnlos.data.capture_info import CameraInfo
 from evnlos.errors import EvnlosError
+from evnlos.inverse.operators import Gradient, normal_matrix
+from evnlos.inverse.sequence_problem import strip_of
 from evnlos.metrics import psnr
 from evnlos.optics import FilmWall
 from evnlos.scene import Film, HandwritingGlyphs, LineMotion, PathMotion, Scene, SeveralTargets
 from evnlos.scene.handwriting import signed_distance
 from evnlos.setups import RadiometricSetup
-from evnlos.tracking import Tracking, Tracks, track_capture, track_frames, track_several
+from evnlos.tracking import (
+    Tracking,
+    Tracks,
+    fit_motion,
+    plane_map,
+    register,
+    static_light,
+    temporal_noise,
+    track_capture,
+    track_frames,
+    track_several,
+)
+from evnlos.tracking.motion_fit import Fit, Lights
 from evnlos.types import Events, Irradiance, Plane
 
-SENSOR, SECONDS, FRAMES = (32, 48), 8.0, 21
+SENSOR, SENSOR_SMALL, SECONDS, FRAMES = (32, 48), (24, 36), 8.0, 21
 PIXEL = EventPixel(0.18, 0.21, 0.04, 40.0, 0.0, 0.3, 0.0)
 CAMERA = FrameCamera(exposure_s=0.016, full_well_e=10_000.0, read_noise_e=48.0, prnu=0.02, dsnu_e=38.0)
 SETUP = RadiometricSetup(
@@ -99,6 +116,110 @@ def retreating(setup: RadiometricSetup, light: float) -> str:
     return f"distance off by {off:.2f} mm, stated {stated:.2f} mm; position off by {1e3 * where:.2f} mm"
 
 
+def drawn_sequence(seed: int, words: list[str]) -> tuple[RadiometricSetup, Scene, NDArray, NDArray, NDArray]:
+    """Return setup, scene, times [N], frames [N, h, w], and the true middles of the light [N, 2], metres."""
+    setup = SETUP if "camera" in words else replace(SETUP, ambient_gradient=(0.0, 0.0))
+    setup, glyphs, draw = setup.resized((24, 36)), HandwritingGlyphs(), np.random.default_rng(seed)
+    times, knots = np.linspace(0.2, 7.8, FRAMES), tuple(np.linspace(0, SECONDS, 5).tolist())
+    target = glyphs.target(f"writer{seed % 8:02d}_{'ABDEFHJLNPRSTUVXYZ'[seed % 18]}")
+    at = ((np.arange(len(target.mask)) + 0.5) / len(target.mask) - 0.5) * target.size_m
+    mx, my = np.array([target.mask.sum(0) @ at, target.mask.sum(1) @ at]) / target.mask.sum()
+    points = tuple((x + 0.008 * draw.normal(), 0.01 * draw.normal()) for x in np.linspace(-0.06, 0.06, 5))
+    away = np.exp(draw.uniform(-0.12, 0.12, 5) if "depth" in words else np.zeros(5))
+    away *= setup.distance_m / np.exp(np.log(PathMotion(knots, points, tuple(away)).pose(times).z_m).mean())
+    turn = tuple(draw.uniform(-35, 35, 5)) if "turn" in words else 0.0
+    scene = Scene(target, PathMotion(knots, points, tuple(away) if "depth" in words else None, turn), SECONDS)
+    wall = setup.observe(scene)
+    if "camera" in words:
+        frames = CAMERA.capture(wall, times, seed=seed) / np.float32(255)
+    else:
+        frames = wall.irradiance(times).numpy() + 4e-3 * draw.standard_normal((FRAMES, 24, 36))
+    pose = scene.pose(times)
+    cos, sin = np.cos(pose.rotation_rad), np.sin(pose.rotation_rad)
+    where = np.stack([pose.x_m + cos * mx - sin * my, pose.y_m + sin * mx + cos * my], axis=1)
+    return setup, scene, times, frames, where
+
+
+def images(sequences: int, depth: bool) -> None:
+    """Print the PSNR of one image of a whole sequence, by what is known of its motion, and what it costs.
+
+    The sequences of `coverage camera`, upright or turning, at the setup's distance or not; 32 x 32 cells by the
+    solver of `track`, scored as the command does. "known": at the true poses; "found": as `track` writes it,
+    blind; "path alone": at the true places, taken for upright at the setup's distance; "static": taken for at
+    rest in the middle of its path; "mean letter": the mean image of the run's other letters. In brackets 95 %
+    of the mean over sequences, by bootstrap. CPU: processor time of the fit with its image, and of the image.
+    With `depth` the targets retreat, too; that takes a minute a sequence.
+    """
+    print("| motion | known | found | known less found | path alone | static | mean letter | CPU, s |")
+    print("|" + "---|" * 8)
+    for words in [["depth", "turn"]] if depth else [[], ["turn"]]:
+        rows, truths = [], []
+        for seed in range(sequences):
+            setup, scene, times, frames, where = drawn_sequence(seed, [*words, "camera"])
+            settings = Tracking(depth="depth" in words, turning="turn" in words)
+            noise, ambient = temporal_noise(frames), static_light(frames)
+            light = torch.from_numpy(frames - ambient)
+            start_m = plane_map(setup, SENSOR_SMALL, 0.1)(register(frames, ambient, noise).place_px)
+            begun = time.process_time()
+            found = fit_motion(
+                light,
+                setup,
+                start_m,
+                noise,
+                0.1,
+                depth=settings.depth,
+                turning=settings.turning,
+                image_cells=32,
+            )
+            spent = time.process_time() - begun
+            pose = scene.pose(times)
+            turn = pose.rotation_rad - pose.rotation_rad.mean()
+            away = np.log(pose.z_m / setup.distance_m) if settings.depth else np.zeros(FRAMES)
+            known = np.column_stack([where, away, turn])
+            ways = [
+                known,
+                known * [1, 1, 0, 0],
+                np.broadcast_to(known.mean(axis=0) * [1, 1, 0, 0], known.shape),
+            ]
+            solved, costs = zip(*[solve_at(light, setup, one, noise) for one in ways], strict=True)
+            db = [
+                track_psnr(scene, image, 0.1, times) for image in (solved[0], found.target.numpy(), *solved[1:])
+            ]
+            rows.append([*db[:2], db[0] - db[1], *db[2:], spent, costs[0]])
+            true = scene.target.turned(float(pose.rotation_rad.mean()))
+            truths.append((scene, times, true.rasterise(Plane(32, 32, 0.1 / 32), -true.light_m)))
+        total = np.sum([one for _, _, one in truths], axis=0)
+        blind = [track_psnr(s, (total - one) / (len(truths) - 1), 0.1, t) for s, t, one in truths]
+        table = np.array(rows)
+        cells = [mean_95(one) for one in (*table.T[:5], np.array(blind))]
+        cost = f"{table[:, 5].mean():.1f}, {table[:, 6].mean():.2f}"
+        print(f"| {' and '.join(words) or 'in its plane'} | {' | '.join(cells)} | {cost} |", flush=True)
+
+
+def solve_at(
+    light: torch.Tensor, setup: RadiometricSetup, pose: NDArray, noise: float
+) -> tuple[NDArray, float]:
+    """Return the image [32, 32] that `track` would solve at poses [N, 4], and its processor time, seconds.
+
+    Poses are x, y, ln(distance / own), turn.
+    """
+    plane = Plane(32, 32, 0.1 / 32)
+    reach = np.concatenate([pose[:, :2] + 0.05, pose[:, :2] - 0.05])
+    lights = Lights(setup, strip_of(reach, plane), SENSOR_SMALL, bool(pose[:, 2].any()), 2)
+    prior = 3.0 * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape).double())
+    begun = time.process_time()
+    fit = Fit(plane, lights, np.array(pose), [0, 1], np.array([1.0, 1.0, 0.3, 0.025]))
+    image = fit.step(lights.seen(light), prior)[0].numpy()
+    return image, time.process_time() - begun
+
+
+def mean_95(values: NDArray) -> str:
+    """Return the mean and, in brackets, its 95 % interval by 2000 bootstrap draws."""
+    draws = np.random.default_rng(0).choice(values, (2000, len(values))).mean(axis=1)
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return f"{values.mean():.2f} ({low:.2f} to {high:.2f})"
+
+
 def coverage(words: list[str], sequences: int = 40) -> None:
     """Print how often the truth lies in the 90 % intervals of x, y, distance and turn, and the largest errors.
 
@@ -106,32 +227,12 @@ def coverage(words: list[str], sequences: int = 40) -> None:
     events. The mean distance is the setup's, as no recording tells it. "camera": noise and fixed pattern of the
     frame camera, another one each time, and ambient light that falls off by a tenth.
     """
-    setup = SETUP if "camera" in words else replace(SETUP, ambient_gradient=(0.0, 0.0))
-    setup, glyphs = setup.resized((24, 36)), HandwritingGlyphs()
-    times, knots = np.linspace(0.2, 7.8, FRAMES), tuple(np.linspace(0, SECONDS, 5).tolist())
     within, most = [], []
     for seed in range(sequences):
-        draw = np.random.default_rng(seed)
-        target = glyphs.target(f"writer{seed % 8:02d}_{'ABDEFHJLNPRSTUVXYZ'[seed % 18]}")
-        at = ((np.arange(len(target.mask)) + 0.5) / len(target.mask) - 0.5) * target.size_m
-        mx, my = np.array([target.mask.sum(0) @ at, target.mask.sum(1) @ at]) / target.mask.sum()
-        points = tuple((x + 0.008 * draw.normal(), 0.01 * draw.normal()) for x in np.linspace(-0.06, 0.06, 5))
-        away = np.exp(draw.uniform(-0.12, 0.12, 5) if "depth" in words else np.zeros(5))
-        away *= setup.distance_m / np.exp(np.log(PathMotion(knots, points, tuple(away)).pose(times).z_m).mean())
-        turn = tuple(draw.uniform(-35, 35, 5)) if "turn" in words else 0.0
-        scene = Scene(
-            target, PathMotion(knots, points, tuple(away) if "depth" in words else None, turn), SECONDS
-        )
-        wall = setup.observe(scene)
-        if "camera" in words:
-            frames = CAMERA.capture(wall, times, seed=seed) / np.float32(255)
-        else:
-            frames = wall.irradiance(times).numpy() + 4e-3 * draw.standard_normal((FRAMES, 24, 36))
+        setup, scene, times, frames, where = drawn_sequence(seed, words)
+        pose, target = scene.pose(times), scene.target
         settings = Tracking(depth="depth" in words, turning="turn" in words)
         track = track_frames(frames, times, None, setup, settings)
-        pose = scene.pose(times)
-        cos, sin = np.cos(pose.rotation_rad), np.sin(pose.rotation_rad)
-        where = np.stack([pose.x_m + cos * mx - sin * my, pose.y_m + sin * mx + cos * my], axis=1)
         off, stated = [1e3 * (track.position - where)], [1e3 * track.position_sigma]
         if track.distance is not None:
             off.append(100 * (track.distance.distance_m / pose.z_m - 1)[:, None])
@@ -261,6 +362,9 @@ def several(pairs: int, cover: bool) -> None:
 def main() -> None:
     if sys.argv[1:2] == ["several"]:
         several(int((sys.argv[2:3] or ["8"])[0]), "cover" in sys.argv[2:])
+        return
+    if sys.argv[1:2] == ["images"]:
+        images(int((sys.argv[2:3] or ["12"])[0]), "depth" in sys.argv[2:])
         return
     if sys.argv[1:2] == ["captures"]:
         on_captures(sys.argv[2], sys.argv[3:])

@@ -30,3 +30,4 @@ from .scores import load_lpips as load_lpips
 from .scores import score as score
 from .scores import scored_sampling as scored_sampling
 from .scores import target_psnr as target_psnr
+from .scores import track_psnr as track_psnr

@@ -1,11 +1,4 @@
-"""Scores of images against the truth: metrics, intervals, a character classifier, LPIPS.
-
-- Scores of images against the truth: on the whole scored canvas and on the target's own box.
-- Intervals for differences between methods, by a paired bootstrap over objects.
-- An independent reader: a small network that names a character, trained on clean glyphs alone.
-- What images of single time steps make of a whole sequence: their mean along the motion.
-- LPIPS with the VGG16 trunk: Zhang et al., CVPR 2018, version 0.1, from files that the user has.
-"""
+"""Scores of images against the truth: metrics, a reader of characters, LPIPS (Zhang et al., CVPR 2018)."""
 
 from __future__ import annotations
 
@@ -30,7 +23,7 @@ from evnlos.data import Capture, Sampling, character_of
 from evnlos.errors import DataError
 from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
 from evnlos.models.drawn import TargetGrid
-from evnlos.scene import Target
+from evnlos.scene import Scene, Target
 from evnlos.tensor_file import read_sealed
 from evnlos.types import target_side_m
 
@@ -307,12 +300,9 @@ def _features(image: Tensor, layers: list[tuple[Tensor, Tensor]]) -> list[Tensor
 
 def _convolutions(state: dict[str, Tensor]) -> list[tuple[Tensor, Tensor]]:
     """Return weight and bias of the thirteen convolutions, in order."""
-    names = sorted((k for k in state if k.startswith("features.") and k.endswith(".weight")), key=_index)
-    return [(state[name], state[name.replace(".weight", ".bias")]) for name in names]
-
-
-def _index(name: str) -> int:
-    return int(name.split(".")[1])
+    names = [k[:-7] for k in state if k.startswith("features.") and k.endswith(".weight")]
+    names.sort(key=lambda name: int(name.split(".")[1]))
+    return [(state[f"{name}.weight"], state[f"{name}.bias"]) for name in names]
 
 
 def _installed_heads() -> Path:
@@ -323,8 +313,6 @@ def _installed_heads() -> Path:
 
 def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: Sampling) -> Tensor:
     """Return images [N, H, W] of which each object's are replaced by their mean along the motion.
-
-    What images of single time steps make of a whole sequence without a network of sequences.
 
     Args:
         images: Images of single time steps on the canvas, [N, H, W].
@@ -355,9 +343,7 @@ def scored_sampling(size_m: float, position_m: NDArray[np.float64] | None = None
     return replace(usual, pitch_m=usual.pitch_m * scale)
 
 
-def target_psnr(
-    capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]
-) -> float | None:
+def target_psnr(capture: Capture, image: Tensor, size_m: float, motion: NDArray) -> float | None:
     """Return the PSNR of an image [cells, cells], dB; None where the truth is unknown or out of view.
 
     Args:
@@ -373,9 +359,24 @@ def target_psnr(
     target = Target("found", image.clamp(0, 1).float().numpy(), size_m)
     images = target.rasterise(sampling.canvas, motion), scene.truth(sampling.canvas, times_s)
     found, true = (torch.from_numpy(one[:, sampling.scored]) for one in images)
-    values = psnr(found, true)
-    values = values[values.isfinite()]  # elsewhere the canvas shows nothing
+    values = (told := psnr(found, true))[told.isfinite()]  # elsewhere the canvas shows nothing
     return round(float(values.mean()), 3) if len(values) else None
+
+
+def track_psnr(scene: Scene, image: NDArray, size_m: float, times_s: NDArray) -> float:
+    """Return the PSNR of an image whose light's middle is in its middle, at the mean turn, as of a track, dB.
+
+    Args:
+        scene: The truth.
+        image: The target plane, [cells, cells].
+        size_m: Its side, metres.
+        times_s: Instants of the frames, [N], seconds.
+    """
+    true = scene.target.turned(float(np.mean(scene.pose(times_s).rotation_rad)))
+    found, sampling = Target("found", image.clip(0, 1), size_m), scored_sampling(scene.target.size_m)
+    shown = found.rasterise(sampling.canvas), true.rasterise(sampling.canvas, -true.light_m)
+    image_on, true_on = (torch.from_numpy(one[sampling.scored]) for one in shown)
+    return round(float(psnr(image_on, true_on)), 3)
 
 
 def confusion(seen: Sequence[dict[str, dict[str, int]]]) -> str:

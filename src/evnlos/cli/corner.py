@@ -1,4 +1,4 @@
-"""`evnlos corner`: a video of the floor in, who moves behind the corner out; and images that `track` found."""
+"""`evnlos corner`: a video of the floor in, who moves behind the corner out; or one is filmed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -23,10 +23,6 @@ from evnlos.machine import ProgressBars, counted
 from evnlos.tracking import UNSURE_NOISE, BearingTracking, BearingTracks
 from evnlos.types import OutFolder
 from evnlos.untrusted import open_regular
-
-if TYPE_CHECKING:
-    from evnlos.data import Capture
-    from evnlos.tracking import Track
 
 _DISTURBED, _SHAKE_PX, _NOISE, _GAIN = 0.02, 0.3, 3.0, 0.01  # beyond these a warning is due
 
@@ -376,25 +372,3 @@ def _errors(tracks: BearingTracks, truth: NDArray[np.float64]) -> list[dict[str,
         within = np.abs(row[known]) <= 1.645 * track.deviation_deg[known]
         found.append({"rms": float(np.sqrt(np.mean(row[known] ** 2))), "within_90": float(within.mean())})
     return found
-
-
-def show_image(capture: Capture, track: Track, path: Path) -> tuple[str | None, float | None]:
-    """Write the image of a track and its array; return its path, as `drawn`, and its PSNR, dB, where known."""
-    import torch
-
-    from evnlos.analysis import scored_sampling
-    from evnlos.cli.invert import save_arrays
-    from evnlos.metrics import psnr
-    from evnlos.plot.results import draw_inversion
-    from evnlos.scene import Target
-
-    picture, known = np.asarray(track.image), None
-    save_arrays(path, {"image": picture})
-    if (scene := capture.scene) is not None:
-        true = scene.target.turned(float(np.mean(scene.pose(track.frame_time_s).rotation_rad)))
-        found = Target("found", picture.clip(0, 1).astype(np.float32), track.size_m)
-        canvas, rows = (sampling := scored_sampling(scene.target.size_m)).canvas, sampling.scored
-        shown = found.rasterise(canvas), true.rasterise(canvas, -true.light_m)
-        image, truth = (torch.from_numpy(one[rows]) for one in shown)
-        known = round(float(psnr(image, truth)), 3)
-    return drawn(path, lambda: draw_inversion(path, [("found", torch.from_numpy(picture)[None])])), known

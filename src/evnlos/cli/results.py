@@ -1,10 +1,4 @@
-"""Commands that show results: `reconstruct`, `track`, `identify`, `report`.
-
-- `evnlos reconstruct`: capture and weights in, images out.
-- `evnlos track`: a capture in, the path and the speed of the hidden object out.
-- `evnlos identify`: a setup in, what it can show at all out.
-- `evnlos report`: runs in, one HTML page out.
-"""
+"""Commands that show results: `reconstruct`, `track`, `identify`, `report`."""
 
 from __future__ import annotations
 
@@ -152,11 +146,13 @@ class TrackCommand:
 
     def run(self) -> None:
         """Follow, print, write the image."""
-        from evnlos.cli.corner import show_image
-        from evnlos.cli.invert import show_tracks
+        from torch import from_numpy
+
+        from evnlos.analysis import track_psnr
+        from evnlos.cli.invert import save_arrays, show_tracks
         from evnlos.cli.invert_captures import linear_setup
         from evnlos.data import pattern_of, read_capture
-        from evnlos.plot.results import draw_track
+        from evnlos.plot.results import draw_inversion, draw_track
         from evnlos.tracking import Tracks, track_capture, track_several, track_warnings
 
         image_path = self.out.with_stem(f"{self.out.stem}_image")
@@ -181,7 +177,11 @@ class TrackCommand:
         found["warnings"] = track_warnings(capture, setup, track)
         found["picture"] = drawn(self.out, lambda: draw_track(track, self.out, truth, capture.name))
         if track.image is not None:
-            found["image"], found["psnr_db"] = show_image(capture, track, image_path)
+            save_arrays(image_path, {"image": track.image})
+            panels = [("found", from_numpy(track.image)[None])]
+            found["image"] = drawn(image_path, lambda: draw_inversion(image_path, panels))
+            known = None if capture.scene is None else (capture.scene, track.image, track.size_m)
+            found["psnr_db"] = None if known is None else track_psnr(*known, track.frame_time_s)
         text = json.dumps({**found, "track": track.summary()})
         write_atomically(self.out.with_suffix(".json"), text.encode())
         print(json.dumps(found) if self.json else to_text(found))
