@@ -37,7 +37,16 @@ from evnlos.inverse.operators import normal_matrix
 from evnlos.models import SequenceConfig, Weights, published_setup, save_weights
 from evnlos.optics import SlidingWall, View
 from evnlos.plot.results import draw_track
-from evnlos.scene import FontGlyphs, LineMotion, OtherTarget, PathMotion, Scene, SeveralTargets, Target
+from evnlos.scene import (
+    FontGlyphs,
+    LineMotion,
+    OtherTarget,
+    PathMotion,
+    Scene,
+    SeveralTargets,
+    Target,
+    TargetPlane,
+)
 from evnlos.setups import RadiometricSetup
 from evnlos.tracking import (
     Distance,
@@ -710,6 +719,54 @@ def test_scores_do_not_depend_on_the_unit_of_length(capture, tmp_path) -> None:
     assert target_psnr(hidden, image, size_m, away) is None  # nothing there, nothing drawn
     sizes = canvas_decibel(0.01, Plane(32, 32, 0.0025)), canvas_decibel(0.01, Plane(32, 32, 0.025))
     assert sizes[0] == pytest.approx(sizes[1])
+
+
+def test_a_target_ten_times_as_large_goes_through_every_command(tmp_path, capsys) -> None:
+    """A target of 0.8 m at 3 m from the wall: no command supposes decimetres, and no flag has to say so."""
+    found = []
+    for scale in (1, 10):
+        folder = tmp_path / str(scale)
+        folder.mkdir()
+        large = replace(
+            SETUP, cell_m=0.008 * scale, strip_m=(0.24 * scale, 0.08 * scale), distance_m=0.3 * scale,
+            camera_distance_m=0.6 * scale, sensor=SensorSize(24, 40),
+        )  # fmt: skip
+        glyphs = FontGlyphs(family="kalam", characters="L", target_plane=TargetPlane(0.08 * scale))
+        motion = LineMotion((-0.04 * scale, 0.0), 0.02 * scale)
+        lab = Lab("big", glyphs, motion=motion, duration_s=4.0, frame_rate_hz=3.0, setup=large, spread={})
+        save_yaml(lab, folder / "lab.yaml")
+        save_yaml(Simulation(glyphs, motion, duration_s=4.0, positions=6, setup=large), folder / "setup.yaml")
+        main(["lab", "--out", str(folder / "captures"), "--config", str(folder / "lab.yaml")])
+        main(
+            [
+                "simulate",
+                "--out",
+                str(folder / "data"),
+                "--config",
+                str(folder / "setup.yaml"),
+                "--workers",
+                "1",
+            ]
+        )
+        capsys.readouterr()
+        words = [
+            str(folder / "captures" / "big_L"),
+            "--setup",
+            str(folder / "setup.yaml"),
+            "--json",
+            "--cells",
+            "12",
+        ]
+        main(["track", *words, "--out", str(folder / "track.png")])
+        tracked = json.loads(capsys.readouterr().out)
+        main(["invert", *words, "--solver", "tikhonov", "--out", str(folder / "invert.png")])
+        (row,) = json.loads(capsys.readouterr().out)["rows"]
+        lengths = [
+            tracked[name] / scale for name in ("travel", "position_error", "position_sigma", "mean_speed")
+        ]
+        found.append([*lengths, tracked["misfit"], tracked["psnr_db"], row["psnr_db"]])
+        assert not tracked["warnings"] and lengths[1] < 1e-3
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-2)
 
 
 def test_the_command_says_where_a_setup_is_not_that_of_the_capture(capture, tmp_path, capsys) -> None:

@@ -1,8 +1,4 @@
-"""From a recording to a track: the light that stands still taken off, then the object followed.
-
-- From a recording to a track: frames give places, events give velocities, a smoother joins them.
-- Several objects at once: their number, their paths, their images.
-"""
+"""From a recording to a track: frames give places, events velocities, a smoother joins them; of several too."""
 
 from __future__ import annotations
 
@@ -43,7 +39,7 @@ from evnlos.types import Events, Plane
 
 _ROUNDS = 20
 _ABOVE = 2.5  # standard deviations over the background from which a pixel shows the object
-_LEAST_SHARE = 0.1
+_LEAST_SHARE, _ROOM = 0.1, 1.25  # of the target's side: the light's middle need not be the target's
 
 
 def static_light(frames: NDArray, degree: int = 2) -> NDArray[np.float64]:
@@ -103,8 +99,8 @@ class Tracking:
     """Length of a window of events that gives one velocity, seconds."""
     events: bool = True
     """Use the events; without them only the frames speak."""
-    target_size_m: float = 0.1
-    """With a setup: side of a square that surely holds the object, metres."""
+    target_size_m: float | None = None
+    """With a setup: side of a square that holds the object, metres; none = 1.25 of capture.yaml's target."""
     cells: int = 20
     """With a setup: cells per side of that square."""
     depth: bool = False
@@ -123,13 +119,18 @@ class Tracking:
         if self.targets != "auto" and not 1 <= self.targets <= MOST_TARGETS:
             raise ConfigError(f"Tracking.targets is {self.targets}; give 1 to {MOST_TARGETS}, or auto")
         for name in ("window_s", "target_size_m"):
-            if not getattr(self, name) > 0:
+            if not (getattr(self, name) is None or getattr(self, name) > 0):
                 raise ConfigError(f"Tracking.{name} is {getattr(self, name)}; give a positive number")
 
     @property
     def most_columns(self) -> int:
         """Columns to which frames are reduced, pixels."""
         return self.columns or (40 if self.depth else 80)
+
+    def of(self, capture: Capture | None) -> float:
+        """Return the side of a square that surely holds the object, metres."""
+        stated = 0.08 if capture is None else capture.info.target_size_m
+        return _ROOM * stated if self.target_size_m is None else self.target_size_m
 
 
 def track_several(
@@ -156,7 +157,7 @@ def track_several(
     if not noise > 0:
         raise DataError(f"{capture.name}: its frames show no noise; give a recording that is not clipped")
     light = torch.from_numpy(small - static_light(small, settings.degree))
-    size_m, gains = settings.target_size_m, list[float]()
+    size_m, gains = settings.of(capture), list[float]()
     if settings.targets == "auto":
         number = count_targets(light, setup, times_s, noise, size_m, settings.cells, degree=settings.degree)
         if not number.found:
@@ -222,9 +223,10 @@ def track_capture(
     Raises:
         DataError: Too few frames, or the object does not stand out.
     """
-    frames = _levels(capture, pattern)
+    frames, times_s = _levels(capture, pattern), capture.frame_times_us.astype(np.float64) * 1e-6
     events = capture.events if capture.has_events else None
-    return track_frames(frames, capture.frame_times_us.astype(np.float64) * 1e-6, events, setup, settings)
+    settings = replace(settings or Tracking(), target_size_m=(settings or Tracking()).of(capture))
+    return track_frames(frames, times_s, events, setup, settings)
 
 
 def track_frames(
@@ -300,11 +302,12 @@ def _in_metres(
     settings: Tracking,
 ) -> Track:
     shape = (small.shape[1], small.shape[2])
-    to_plane = plane_map(setup, shape, settings.target_size_m)
+    size_m = settings.of(None)
+    to_plane = plane_map(setup, shape, size_m)
     light = torch.from_numpy(small - found.background)
     start_m = to_plane(found.place_px)
     fitted = fit_motion(
-        light, setup, start_m, noise, settings.target_size_m, settings.cells,
+        light, setup, start_m, noise, size_m, settings.cells,
         depth=settings.depth, turning=settings.turning, degree=settings.degree, image_cells=_IMAGE_CELLS,
     )  # fmt: skip
     variance = np.einsum("nknk->nk", fitted.covariance)
