@@ -148,7 +148,7 @@ def images(sequences: int, depth: bool) -> None:
     blind; "path alone": at the true places, taken for upright at the setup's distance; "static": taken for at
     rest in the middle of its path; "mean letter": the mean image of the run's other letters. In brackets 95 %
     of the mean over sequences, by bootstrap. CPU: processor time of the fit with its image, and of the image.
-    With `depth` the targets retreat, too; that takes a minute a sequence.
+    With `depth` the targets retreat, too; that takes minutes.
     """
     print("| motion | known | found | known less found | path alone | static | mean letter | CPU, s |")
     print("|" + "---|" * 8)
