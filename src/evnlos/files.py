@@ -243,7 +243,8 @@ def _in_place_of(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     except BaseException as error:
         if isinstance(error, OSError) and error.filename == str(temporary):
-            error.filename = str(path)  # the name that a user knows
+            with suppress(AttributeError):  # PyAV's errors keep theirs
+                error.filename = str(path)  # the name that a user knows
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
             for folder in made:
