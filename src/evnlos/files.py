@@ -242,8 +242,8 @@ def _in_place_of(path: Path) -> Iterator[Path]:
         _synchronise(temporary)
         temporary.replace(path)
     except BaseException as error:
-        if isinstance(error, OSError) and error.filename == str(temporary):
-            with suppress(AttributeError):  # PyAV's errors keep theirs
+        with suppress(AttributeError):  # PyAV's errors keep theirs
+            if isinstance(error, OSError) and error.filename == str(temporary):
                 error.filename = str(path)  # the name that a user knows
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -304,8 +304,7 @@ def _is_alive(process: int) -> bool:
 ADDRESSES: tuple[str, ...] = ()
 """Where published captures, weights and examples lie, the first that answers counts; none is public yet."""
 ADDRESS_VARIABLE = "EVNLOS_DATA"  # addresses that come before those, separated by spaces; also folders
-LIST = "SHA256SUMS"
-"""File of a published folder that names its files: a SHA-256 and a path below the folder a line."""
+LIST = "SHA256SUMS"  # names the files of a published folder: a SHA-256 and a path below the folder a line
 _MOST_LIST_BYTES, _ANSWER_S = 1 << 20, 20.0
 _LINE = re.compile(r"([0-9a-f]{64})  (\S[^\\\0\r\n]*)", re.A)
 
