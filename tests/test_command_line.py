@@ -92,6 +92,7 @@ def test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows(encoding
     for words, said in (
         (("--port", "abc"), "--port is 'abc'; give a whole number"),
         (("--prot", "3"), "Unrecognized options: --prot, 3; Perhaps you meant: --port INT"),
+        (("one", "two"), "one, two: app takes no more of these; give one at a time"),
         (("--port",), "Missing value for argument '--port'. Expected 1 values"),
     ):
         done = subprocess.run(

@@ -217,15 +217,14 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
         if not end.code:
             raise
         text = _plain(in_one_line(said.getvalue()))
-        if (
-            unknown := re.search(r"Unrecognized options: (--[\w.-]+)", text)
-        ) and "Perhaps you meant" not in text:
+        unknown = re.search(r"Unrecognized options: (--[\w.-]+|.*)", text)
+        if unknown and not unknown[1].startswith("-"):
+            text = f"{unknown[1]}: {verb} takes no more of these; give one at a time"
+        elif unknown and "Perhaps you meant" not in text:
             with contextlib.redirect_stdout(io.StringIO()) as page, contextlib.suppress(SystemExit):
                 tyro.cli(command, args=["--help"], default=default, config=config)
-            flags = set(re.findall(r"--[\w.-]*\w", page.getvalue()))
-            text += "".join(
-                f"; perhaps you meant {one}" for one in difflib.get_close_matches(unknown[1], flags, 1)
-            )
+            near = difflib.get_close_matches(unknown[1], set(re.findall(r"--[\w.-]*\w", page.getvalue())), 1)
+            text += "".join(f"; perhaps you meant {one}" for one in near)
         raise UnfitWordsError(f"{text}; see evnlos {verb} --help") from None
     except (ArithmeticError, MemoryError, ValueError) as error:  # of a setting that only fits together
         raise ConfigError(f"the settings do not fit together ({error}); see evnlos {verb} --help") from None
@@ -347,7 +346,7 @@ def flag_value(words: list[str], flag: str) -> str | None:
     return None
 
 
-_IMAGES = {".png", ".svg", ".pdf", ".eps", ".ps", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ""}
+_IMAGES = {".png", ".svg", ".pdf", ".eps", ".ps", ".jpg", ".jpeg", ".tif", ".tiff", ".webp"}
 
 
 def refuse_existing(force: bool, *paths: Path) -> None:
