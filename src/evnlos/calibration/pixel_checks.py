@@ -28,10 +28,7 @@ _UNLIKELY = 0.01
 _FEWEST_PAIRS = 30  # intervals that are all alike before they count as the refractory period
 _FINE_TICKS = 5  # ticks of the time stamps that a refractory period must last to be told from them
 _PILE = 5.0  # times as many intervals at the shortest as just above it
-_TEETH, _PARTS = (
-    6,
-    8,
-)  # how far a comb is followed, and in how many parts of the shortest interval
+_TEETH, _PARTS = 6, 8  # how far a comb is followed, and in how many parts of the shortest interval
 _ON_COMB = 0.7  # resultant of the phases: 1 on a comb, 0.6 where intervals fall off in a fifth of it
 _STATIC_S, _STATIC_PX = 10.0, 200
 _BINS = 24

@@ -116,16 +116,11 @@ def steps_table(fit: SetupFit) -> str:
     Args:
         fit: The calibration.
     """
-    if not (steps := _steps(fit)):
+    if not (steps := fit.simulation.setup.steps()):
         return ""
     cells = [["step of the wall's fit, % of what was left beside the noise", "taken away", ""]]
     cells += [[n, f"{100 * share:.1f}", "kept" if kept else "left out"] for n, (share, kept) in steps.items()]
     return aligned(cells)
-
-
-def _steps(fit: SetupFit) -> dict[str, tuple[float, bool]]:
-    setup = fit.simulation.setup
-    return setup.steps() if isinstance(setup, FittedSetup) else {}
 
 
 def warnings_of(fit: SetupFit) -> list[str]:
@@ -243,7 +238,10 @@ def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
         "warnings": warnings_of(fit),
         "expectation": expectation(fit),
         "shown": None if fit.shown is None else asdict(fit.shown),
-        "steps": {name: {"explained": share, "kept": kept} for name, (share, kept) in _steps(fit).items()},
+        "steps": {
+            name: {"explained": share, "kept": kept}
+            for name, (share, kept) in fit.simulation.setup.steps().items()
+        },
         "residuals": {
             name: {"before": round(r.before, 5), "after": round(r.after, 5), "noise": round(r.noise, 5)}
             for name, r in fit.residuals.items()

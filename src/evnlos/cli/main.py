@@ -296,9 +296,8 @@ def _check_kinds(settings: Any, words: list[str], prefix: str = "--") -> None:
             _check_kinds(here, words, f"{flag}.")
 
 
-_DECIDES = re.compile(
-    r"--(config|setup|pixel|pictures|[\w.-]+\.kind)(=|$)"
-)  # what decides which flags there are
+# What decides which flags there are.
+_DECIDES = re.compile(r"--(config|setup|pixel|pictures|[\w.-]+\.kind)(=|$)")
 
 
 def _command(verb: str, rest: list[str]) -> Any:

@@ -21,7 +21,7 @@ from evnlos.events.volume import WORDS
 from evnlos.plot.setup import PARTITION, setup_drawing
 from evnlos.report.pictures import animation, curves_svg, data_uri, grey, png, polarity, stretched, strip
 from evnlos.report.tables import METHODS, RunResult, baselines_of, label
-from evnlos.setups import FittedSetup, Setup
+from evnlos.setups import Setup
 
 _LOWEST = 1e-3
 
@@ -33,7 +33,7 @@ def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, target
     if setup is None:
         said = "The setup is not known to this page; <code>evnlos report --setup SETUP.yaml</code> draws it."
         return f"{head}<p class=dim>{said}</p>"
-    if isinstance(setup, FittedSetup) and (steps := setup.steps()):
+    if steps := setup.steps():
         told = "; ".join(
             f"{step} {100 * share:.1f} % ({'kept' if kept else 'left out'})"
             for step, (share, kept) in steps.items()

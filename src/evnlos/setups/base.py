@@ -236,6 +236,10 @@ class Setup(Kinded, ABC):
         """Return what is known to be wrong with this setup, a line each; whoever uses it repeats them."""
         return [f"the calibration of this setup warns: {self.misfit}"] if self.misfit else []
 
+    def steps(self) -> dict[str, tuple[float, bool]]:
+        """Return what each step of the setup's fit explains, and whether it is kept, by name; here none."""
+        return {}
+
     def wall_description(self) -> str:
         """Return what the wall is, in a few words."""
         return f"wall of a {self.kind} setup"
@@ -329,8 +333,7 @@ class Setup(Kinded, ABC):
     def optics(self: S) -> S:
         """Return wall and geometry alone, with default light and cameras: equal where the light paths are."""
         fresh = type(self)()
-        other = (*LIGHT_FIELDS, *CAMERA_FIELDS, "misfit")
-        own = replace(self, **{item: getattr(fresh, item) for item in other})
+        own = replace(self, **{k: getattr(fresh, k) for k in (*LIGHT_FIELDS, *CAMERA_FIELDS, "misfit")})
         return replace(own, sensor=self.sensor.resized(fresh.shape))
 
 
