@@ -175,7 +175,8 @@ def test_the_drawn_target_that_explains_a_sequence_best_is_a_baseline(apart) -> 
     about = drawn_targets(apart.out / "setups" / "lab").about
     targets = DrawnTargets(about, torch.from_numpy(np.stack(masks)))
     truth = NlosDataset(made, "all", "frame").truth.float()
-    assert (retrieved(targets, seen, "test", operator) - truth).square().mean() < 1e-4
+    # 30 dB and not more: the truth itself is among the targets, and is bent a little towards the noise
+    assert (retrieved(targets, seen, "test", operator) - truth).square().mean() < 1e-3
 
 
 def test_other_networks_under_the_name_of_a_record_are_scored_anew(records, apart) -> None:

@@ -7,11 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+import torch
+import torch.nn.functional as F
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import handwritten_prior
+from evnlos.inverse import best_bent, handwritten_prior
 from evnlos.inverse.prior import letters, written_alike
 from evnlos.scene import (
     TRAIN_WRITERS,
@@ -263,3 +265,23 @@ def test_the_prior_has_the_size_and_the_place_of_the_ink():
     assert left[1] < left[0] / 3
     ys, xs = np.nonzero(part.mean.reshape(32, 32) > 0.1)
     assert np.ptp(xs) * 0.002 < 0.04 and xs.mean() == pytest.approx(15.5 + 5, abs=1.5) and np.ptp(ys) < 20
+
+
+def test_a_search_bends_the_right_letter_until_it_explains_a_measurement() -> None:
+    """A letter seen through a random matrix, larger, turned and shifted: found, and close to as it is."""
+    draw = np.random.default_rng(3)
+    masks = torch.from_numpy(np.stack([one.mask for one in letters()[:200]])).float()
+    angle, size = np.deg2rad(7), 0.9
+    turn = size * torch.tensor([[np.cos(angle), -np.sin(angle), 0.06], [np.sin(angle), np.cos(angle), -0.04]])
+    grid = F.affine_grid(turn.float()[None], [1, 1, 64, 64], align_corners=False)
+    shown = F.grid_sample(masks[40][None, None], grid, align_corners=False)
+    light = torch.from_numpy(draw.standard_normal((300, 32 * 32)))
+    seen = light @ F.interpolate(shown, (32, 32), mode="area").flatten().double()
+
+    def explained(targets: torch.Tensor) -> torch.Tensor:
+        drawn = targets @ light.T
+        return (drawn @ seen).clamp_min(0) ** 2 / drawn.square().sum(dim=1).clamp_min(1e-9)
+
+    found = best_bent(masks, (32, 32), explained)
+    assert (found - shown[0, 0]).square().mean() < 0.1 * (masks[40] - shown[0, 0]).square().mean()
+    assert torch.equal(found, best_bent(masks, (32, 32), explained))

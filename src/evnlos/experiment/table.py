@@ -10,13 +10,12 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling, confusion
@@ -37,6 +36,7 @@ from evnlos.data import (
 from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
 from evnlos.files import write_atomically
+from evnlos.inverse import best_bent
 from evnlos.inverse.sequence_problem import SequenceOperator, strip_gram_of
 from evnlos.machine import Progress
 from evnlos.models import DrawnTargets, FrameOperator, drawn_targets, fit_linear, load_weights
@@ -171,7 +171,7 @@ def retrieved(targets: DrawnTargets, recorded: Dataset, split: str, operator: Fr
     With y the frames, A the light path and x a target at the known places, each less its mean over the
     sequence, it has the least |y - g A x|^2 at its own best brightness g >= 0: the largest
     (x^T A^T y)^2 / (x^T A^T A x), from the normal equations of all time steps together. What stands still
-    counts for nothing.
+    counts for nothing. The targets that explain most are bent until they explain more (`inverse.best_bent`).
 
     Args:
         targets: What is searched.
@@ -187,7 +187,6 @@ def retrieved(targets: DrawnTargets, recorded: Dataset, split: str, operator: Fr
     """
     masks, size_m, canvas = targets.masks.float(), targets.about.size_m, recorded.sampling.canvas
     plane = Plane(SIDE, SIDE, size_m / SIDE)
-    searched = F.interpolate(masks[:, None], plane.shape, mode="area").flatten(1).double()  # [G, n n]
     cells = Plane(operator.rows.stop - operator.rows.start, canvas.width, canvas.pitch_m)
     transport = MatrixTransport(operator.matrix, cells, operator.size)
     strip_gram = strip_gram_of(transport)
@@ -199,11 +198,16 @@ def retrieved(targets: DrawnTargets, recorded: Dataset, split: str, operator: Fr
         sight = SequenceOperator(transport, plane, samples.position_m)
         frames = torch.from_numpy(samples.frame)
         back = sight.adjoint(frames - frames.mean(dim=0)).flatten().double()
-        power = ((searched @ sight.gram(strip_gram, math.inf)) * searched).sum(dim=1)
-        best = int(((searched @ back).clamp_min(0).square() / power.clamp_min(1e-12)).argmax())
-        target = Target(name, masks[best].numpy(), size_m)
+        explained = partial(_explained, back, sight.gram(strip_gram, math.inf))
+        target = Target(name, best_bent(masks, plane.shape, explained).numpy(), size_m)
         found.append(torch.from_numpy(target.rasterise(canvas, samples.position_m)))
     return torch.cat(found)
+
+
+def _explained(back: Tensor, gram: Tensor, targets: Tensor) -> Tensor:
+    """Return how much of |y|^2 each target [K, n] explains, from A^T y [n] and A^T A [n, n]."""
+    power = ((targets @ gram) * targets).sum(dim=1)
+    return (targets @ back).clamp_min(0).square() / power.clamp_min(1e-12)
 
 
 def _consistent(study: Study, arm: Arm, recorded: Dataset, place: Place, images: Tensor) -> Tensor:

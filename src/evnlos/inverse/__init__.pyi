@@ -41,6 +41,7 @@ from .operators import ridge_by_groups as ridge_by_groups
 from .operators import unexplained as unexplained
 from .prior import PatternPrior as PatternPrior
 from .prior import ScoreErrors as ScoreErrors
+from .prior import best_bent as best_bent
 from .prior import handwritten_prior as handwritten_prior
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem

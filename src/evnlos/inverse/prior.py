@@ -3,18 +3,20 @@
 - Handwriting as a prior and as a test, on the cells of any plane.
 - Mean target, and the patterns in which targets differ most: a target as a few numbers.
 - The letters of the usual prior come with the package: drawing them takes ten seconds, and fonts.
+- The target among many that explains a measurement best, bent until it fits.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
@@ -36,6 +38,10 @@ LETTERS = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=11, strokes=Str
 """Letters of the usual prior, as many writers as faces: handwriting, and print."""
 LETTERS_FILE, LETTER_PX = Path(__file__).with_name("letters.png"), 64
 """They are drawn there, a row a writer, on squares of so many cells (`tools/draw_letters.py`)."""
+
+_ROUNDS = ((64, 0.10), (32, 0.07), (16, 0.05), (16, 0.035), (8, 0.025), (8, 0.0175), (8, 0.01), (8, 0.007))
+"""Of a search by `best_bent`: candidates that each round keeps, and the spread of its trials."""
+_TRIALS = 48
 
 _PEN_MARGIN = 0.1  # the pens' range is widened by this fraction at both ends
 _TEST_WRITERS = 2
@@ -298,3 +304,45 @@ class ScoreErrors:
             own = torch.randn(count, part.shape[1], generator=generator, dtype=torch.float64)
             drawn = drawn + own @ torch.from_numpy(part).T
         return drawn
+
+
+@torch.no_grad()
+def best_bent(
+    masks: torch.Tensor, shape: tuple[int, int], explained: Callable[[torch.Tensor], torch.Tensor]
+) -> torch.Tensor:
+    """Return the target that explains a measurement best, among given ones and affine images of them.
+
+    The best of the given ones go through rounds of trials: each is shifted, scaled, turned and slanted at
+    random (its affine matrix plus Gaussian numbers, in half sides), and the best of its trials takes its place;
+    fewer candidates and smaller steps follow. The same call draws the same trials.
+
+    Args:
+        masks: Given targets, float [M, h, h], 0..1.
+        shape: Cells on which `explained` sees them.
+        explained: Maps targets [K, n n], float64, to how much of the measurement each explains, [K].
+
+    Returns:
+        A bent mask, float [h, h], 0..1.
+    """
+    given = F.interpolate(masks[:, None], shape, mode="area").flatten(1).double()
+    scores, kept = explained(given), torch.arange(len(masks))
+    affine = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], device=masks.device).repeat(len(masks), 1, 1)
+    draw = torch.Generator().manual_seed(0)
+    for count, spread in _ROUNDS:
+        top = scores.topk(min(count, len(scores))).indices
+        kept, affine = kept[top], affine[top]
+        steps = spread * torch.randn(len(top), _TRIALS, 2, 3, generator=draw)
+        steps[:, 0] = 0  # as it is: no round loses
+        tried = (affine[:, None] + steps.to(affine)).flatten(0, 1)
+        bent = _bent(masks[kept.repeat_interleave(_TRIALS)], tried)
+        cells = F.interpolate(bent[:, None], shape, mode="area").flatten(1).double()
+        scores, best = explained(cells).reshape(-1, _TRIALS).max(dim=1)
+        affine = tried.reshape(-1, _TRIALS, 2, 3)[torch.arange(len(top)), best]
+    first = scores.argmax()
+    return _bent(masks[kept[first]][None], affine[first][None])[0].clamp(0, 1)
+
+
+def _bent(masks: torch.Tensor, affine: torch.Tensor) -> torch.Tensor:
+    """Return masks [K, h, h] through one affine matrix each, [K, 2, 3]; outside is dark."""
+    grid = F.affine_grid(affine, [len(masks), 1, *masks.shape[1:]], align_corners=False)
+    return F.grid_sample(masks[:, None], grid, align_corners=False)[:, 0]
