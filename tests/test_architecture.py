@@ -105,6 +105,7 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",
+    "events/files/aedat.py",
     "inverse/corner.py",
     "lab/light_path.py",
     "models/sequence.py",
@@ -114,7 +115,7 @@ WHOLE_CHAPTERS = {
     "scene/moving.py",
     "tracking/motion_fit.py",
 }
-"""Settings, equations and loops of one model or measurement: cut in two, a reader would need both halves."""
+"""One model, measurement or family of formats: cut in two, a reader would need both halves."""
 
 
 def test_no_file_is_long() -> None:

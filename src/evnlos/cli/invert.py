@@ -68,6 +68,9 @@ class InvertCommand:
     """Captures: estimate the target from these by one likelihood of the whole sequence and a Gaussian prior of
     handwriting, with the uncertainty of each cell; none = the solvers, which take frames. Events need the
     thresholds and the optics of this very sensor: it is said where they do not fit."""
+    samples: int = 0
+    """With --from: targets to draw from what the data and a learned prior of letters and drawings allow, some
+    30; their mean is the image, and where they differ it is a guess. 0 = the Gaussian prior, none are drawn."""
     changing: tuple[float, float] | None = None
     """One capture: nothing moves as a whole; estimate a film of a hidden plane of this width and height,
     metres, whose middle is that of the setup's target plane: an image per frame, with an error of each cell,
@@ -99,13 +102,15 @@ class InvertCommand:
 
     def run(self) -> None:
         """Invert, print the figures, write the image."""
-        for flag, least in (("cells", 2), ("columns", 2), ("subsets", 1)):
+        for flag, least in (("cells", 2), ("columns", 2), ("subsets", 1), ("samples", 0)):
             if (value := getattr(self, flag)) < least:
                 raise ConfigError(f"--{flag} is {value}; give {least} or more")
         if self.regularization == "gcv" and self.solver != "tikhonov":
             raise ConfigError("--regularization gcv serves --solver tikhonov only; give that, or a number")
         if self.colours and (self.setup is None or self.evidence or self.changing or self.pattern):
             raise ConfigError("--colours takes captures, by the solvers; leave --from, --changing, --pattern")
+        if self.samples and self.evidence is None:
+            raise ConfigError(f"--samples {self.samples} takes --from frames, events or both; give one of them")
         if self.setup is not None:
             still = all(path.is_file() for path in self.files)
             (self._invert_stills if still else self._invert_captures)(self.setup)
@@ -223,7 +228,9 @@ class InvertCommand:
             say("red, green, blue are {:.2f}, {:.2f}, {:.2f} of the truth".format(*np.mean(levels, axis=0)))
         left = work.shares_left(found["rows"]).values()
         told = f"{100 * max(left):.1f} % of the light unexplained beside the noise; " if left else ""
-        table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{told}{found['seconds']} s"
+        table = (
+            f"{' '.join(found['captures'])}\n{work.sequence_table(found['rows'])}\n{told}{found['seconds']} s"
+        )
         print(json.dumps(found) if self.json else table)
 
     def _film(self, word: Path, sides_m: tuple[float, float]) -> None:
@@ -288,10 +295,11 @@ class InvertCommand:
                 "--from takes whole sequences of known motion; leave --positions, --track, --solver"
             )
         with ProgressBars() as progress:
-            found, pictures = estimate_captures(self.files, setup, evidence, self.pattern, progress)
+            how = evidence, self.pattern, self.samples
+            found, pictures = estimate_captures(self.files, setup, *how, progress)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
-        panels = [(name, image[None]) for name, image in pictures.items()]
+        panels = [(name, image[None]) for name, image in pictures.items() if image.ndim == 2]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         save_arrays(self.out, pictures)
         print(json.dumps(found) if self.json else sequence_text(found))
@@ -347,20 +355,6 @@ def _weight(text: str) -> tuple[float | None, Literal["cv", "gcv", "discrepancy"
     if number is None:
         raise ConfigError(f"--regularization is {text!r}; give cv, gcv, discrepancy or a number from 0 on")
     return number, "cv"
-
-
-def sequence_table(rows: list[dict[str, Any]]) -> str:
-    """Return mean PSNR by number of positions and solver, over captures and subsets, as lines for people."""
-    solvers = list(dict.fromkeys(row["solver"] for row in rows))
-    lines = ["positions " + "".join(f"{s:>12}" for s in solvers)]
-    for count in dict.fromkeys(row["positions"] for row in rows):
-        values = []
-        for solver in solvers:
-            known = [r["psnr_db"] for r in rows if (r["positions"], r["solver"]) == (count, solver)]
-            db = [v for v in known if v is not None]
-            values.append(f"{np.mean(db):9.2f} dB" if db else f"{'-':>12}")
-        lines.append(f"{count:9d} " + "".join(values))
-    return "\n".join(lines)
 
 
 def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool, warnings: list[str]) -> None:

@@ -26,27 +26,20 @@ from evnlos.data import Capture, load_pattern, pattern_of, read_capture
 from evnlos.data.fixed_pattern import object_light
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
-    FrameTerm,
-    SequenceEstimate,
     SequenceOperator,
     SequenceProblem,
-    estimate_sequence,
-    record_of,
-    sequence_light,
     unexplained,
 )
-from evnlos.inverse.event_images import event_prior
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
 from evnlos.inverse.tikhonov import Rule
 from evnlos.machine import Progress, Step, counted, silent
+from evnlos.models import TargetEstimate, estimate_target, load_prior
 from evnlos.setups import Setup, load_setup
 from evnlos.setups.base import linear_kinds
 from evnlos.tracking import temporal_noise
 from evnlos.types import COLOURS, Colour, Plane
-
-_PATTERNS = 120  # of a target: all that a minute of a core allows where events are solved in full
 
 
 @dataclass(frozen=True)
@@ -268,10 +261,9 @@ def figures_of(name: str, solution: Solution) -> dict[str, Any]:
     }
 
 
-_GAP_S = 0.4  # between the instants at which silences are looked at
-_NORMAL_90 = 1.645
 _MOST_LEFT = 0.1  # of the light's own changes
 _FURTHEST = 0.15  # of fitted thresholds from the setup's, relative
+_SHOWN = 3  # samples that stand beside an image
 
 
 def estimate_captures(
@@ -279,6 +271,7 @@ def estimate_captures(
     word: Path,
     evidence: Literal["frames", "events", "both"],
     pattern: Path | None,
+    learned: int = 0,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and of each capture the target [cells, cells] and its standard deviation, by name.
@@ -288,75 +281,53 @@ def estimate_captures(
         word: Their setup.
         evidence: What the likelihood is made of.
         pattern: Fixed pattern of the frame camera; without it an offset of each pixel is integrated out.
+        learned: Samples under the learned prior; 0: the Gaussian prior, without any.
         progress: Called as each capture is done.
 
     Raises:
         ConfigError: The setup is not linear, its event model states no law, or a motion is unknown.
     """
-    setup = linear_setup(word)
+    setup, prior = linear_setup(word), load_prior() if learned else None
     known = None if pattern is None else load_pattern(pattern)
     lights: dict[Any, Any] = {}
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
         capture = read_capture(folder, needs_frames=evidence != "events", needs_events=evidence != "frames")
-        motion = capture.motion
-        if motion is None:
-            raise ConfigError(f"{folder}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
-        motion, size = motion.in_its_plane(), capture.info.target_size_m
-        prior = event_prior(setup, size, _PATTERNS)
-        span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)
-        shape = (capture.events.height, capture.events.width)
-        key = (motion, span, shape, size)
-        if key not in lights:
-            lights[key] = sequence_light(setup.seen_by(shape), prior, motion.position_m, span, shape)
-        light = lights[key]
-        begun = time.process_time()
-        frames = record = law = None
-        if evidence != "events":
-            peak = float(capture.peak)
-            levels = capture.frames / peak if known is None else known.correct(capture.frames, peak)
-            values = np.asarray(levels, np.float64).reshape(len(levels), -1)
-            times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
-            camera, factor = setup.frame_camera, setup.frame_doubt
-            frames = FrameTerm(light, values, times, camera, known is not None, factor)
-        if evidence != "frames":
-            law = setup.pixel.crossing_law(light.typical_dn)
-            if law is None:
-                raise ConfigError(
-                    f"{word}: its event model states no law of its crossings; give one of kind continuous, "
-                    "v2e, brownian or circuit, or --from frames"
-                )
-            record = record_of(capture.events, law, span, _GAP_S)
-        found = estimate_sequence(light, prior, law, record, frames)
-        seconds = round(time.process_time() - begun, 1)
-        rows.append({**_row(capture, found, prior.target_plane), "seconds": seconds})
+        found = estimate_target(capture, setup, evidence, known, prior, learned, lights)
+        rows.append(_row(capture, found))
         pictures[capture.name] = torch.from_numpy(found.image)
         pictures[f"{capture.name} deviation"] = torch.from_numpy(found.deviation)
+        if found.samples is not None:
+            for k, one in enumerate(found.samples[:_SHOWN], 1):
+                pictures[f"{capture.name} sample {k}"] = one
+            pictures[f"{capture.name} samples"] = found.samples
     return {"setup": str(word), "from": evidence, "rows": rows}, pictures
 
 
-def _row(capture: Capture, found: SequenceEstimate, target_plane: Plane) -> dict[str, Any]:
+def _row(capture: Capture, found: TargetEstimate) -> dict[str, Any]:
     """Return the figures of a capture."""
     assert capture.motion is not None
-    size = target_plane.pitch_m * target_plane.width
+    size = found.plane.pitch_m * found.plane.width
     motion = capture.motion.position_m(capture.frame_times_us[1:] * 1e-6)
-    seen = scored_sampling(size, motion)
+    seen, data = scored_sampling(size, motion), found.likelihood
     row: dict[str, Any] = {
         "capture": capture.name,
         "psnr_db": target_psnr(capture, torch.from_numpy(found.image), size, motion),
-        "expected_db": round(canvas_decibel(found.expected_error, target_plane, seen), 2),
+        "expected_db": round(canvas_decibel(found.expected_error, found.plane, seen), 2),
     }
     if capture.target is not None:
-        truth = capture.target.rasterise(target_plane)
-        away = np.abs(found.image - truth) / found.deviation
-        row["covered_90"] = round(float((away < _NORMAL_90).mean()), 3)
-    if math.isfinite(found.noise):
+        truth = capture.target.rasterise(found.plane)
+        row["covered_90"] = round(float(((truth >= found.low) & (truth <= found.high)).mean()), 3)
+    if found.samples is not None:
+        row["open_share"] = round(found.open_share, 3)
+    if math.isfinite(data.noise):
         row |= {
-            "crossing_noise": round(found.noise, 4),
-            "noise_share": round(found.noise_share, 3),
-            "threshold_factors": [round(factor, 3) for factor in found.thresholds],
-            "leak_per_s": round(found.leak, 4),
+            "crossing_noise": round(data.noise, 4),
+            "noise_share": round(data.noise_share, 3),
+            "threshold_factors": [round(factor, 3) for factor in data.thresholds],
+            "leak_per_s": round(data.leak, 4),
         }
+    row["seconds"] = found.seconds
     return row
 
 
@@ -383,7 +354,9 @@ def sequence_doubts(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 def sequence_text(found: dict[str, Any]) -> str:
     """Return the figures as lines for people."""
+    is_learned = "open_share" in found["rows"][0]
     lines = [f"{'capture':12}{'PSNR':>9}{'expected':>10}{'in 90 %':>9}{'crossing':>10}{'noise':>7}{'CPU':>8}"]
+    lines[0] += f"{'open':>7}" if is_learned else ""
     for row in found["rows"]:
         psnr = "-" if row["psnr_db"] is None else f"{row['psnr_db']:.2f}"
         covered = f"{100 * row['covered_90']:.0f} %" if "covered_90" in row else "-"
@@ -391,10 +364,26 @@ def sequence_text(found: dict[str, Any]) -> str:
         share = f"{100 * row['noise_share']:.0f} %" if "noise_share" in row else "-"
         lines.append(
             f"{row['capture']:12}{psnr:>9}{row['expected_db']:>10.2f}{covered:>9}{crossing:>10}{share:>7}"
-            f"{row['seconds']:>6.1f} s"
+            f"{row['seconds']:>6.1f} s" + (f"{100 * row['open_share']:>5.0f} %" if is_learned else "")
         )
     known = [row["psnr_db"] for row in found["rows"] if row["psnr_db"] is not None]
     if known:
         expected = float(np.mean([row["expected_db"] for row in found["rows"]]))
         lines.append(f"{'mean':12}{float(np.mean(known)):>9.2f}{expected:>10.2f}")
+    if is_learned:
+        lines.append("open: cells that the data leave open; what a sample shows there may be invented")
+    return "\n".join(lines)
+
+
+def sequence_table(rows: list[dict[str, Any]]) -> str:
+    """Return mean PSNR by number of positions and solver, over captures and subsets, as lines for people."""
+    solvers = list(dict.fromkeys(row["solver"] for row in rows))
+    lines = ["positions " + "".join(f"{s:>12}" for s in solvers)]
+    for count in dict.fromkeys(row["positions"] for row in rows):
+        values = []
+        for solver in solvers:
+            known = [r["psnr_db"] for r in rows if (r["positions"], r["solver"]) == (count, solver)]
+            db = [v for v in known if v is not None]
+            values.append(f"{np.mean(db):9.2f} dB" if db else f"{'-':>12}")
+        lines.append(f"{count:9d} " + "".join(values))
     return "\n".join(lines)

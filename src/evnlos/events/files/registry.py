@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from evnlos.errors import DataError, EventFileError
 from evnlos.events.files import (
     aedat,
-    aedat3,
     aedat4,
     celex,
     container_write,
@@ -160,16 +159,16 @@ FORMATS = (
     Format(
         "AEDAT2",
         (".aedat",),
-        lambda start: start.startswith(aedat.SIGNATURE),
+        lambda start: start.startswith(aedat.SIGNATURE_2),
         _plain(aedat.Aedat2Source),
         frames=aedat.aedat2_frames,
     ),
     Format(
         "AEDAT3",
         (".aedat",),
-        lambda start: start.startswith(aedat3.SIGNATURE),
-        _of_streams(aedat3.Aedat3Source),
-        frames=aedat3.aedat3_frames,
+        lambda start: start.startswith(aedat.SIGNATURE_3),
+        _of_streams(aedat.Aedat3Source),
+        frames=aedat.aedat3_frames,
         has_streams=True,
     ),
     _ros("DB3", ros_bags.DB3_SIGNATURE, ros_bags.Db3File),

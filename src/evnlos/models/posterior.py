@@ -1,0 +1,356 @@
+"""What the frames and events of a sequence say of its target, under a Gaussian prior or a learned one.
+
+The Gaussian posterior is that of `inverse.estimate_sequence`. A learned prior is a network that takes noise out
+of drawn targets:
+
+D(y, s) = E[x | y = x + s n] of drawn targets x, n normal, knows their density blurred by s: its gradient is
+(D - y) / s^2 (Vincent, A connection between score matching and denoising autoencoders, 2011; Karras et al.,
+Elucidating the design space of diffusion-based generative models, NeurIPS 2022). A measurement says
+L(x) = exp(b^T z - z^T A z / 2) of the coefficients z of a target. Samples of p(x) L(x) are drawn by two steps
+in turn, at a distance r that falls to the least (split Gibbs: Vono et al., 2019; Wu et al., Principled
+probabilistic imaging using diffusion models as plug-and-play priors, NeurIPS 2024):
+
+- u | x from L(u) N(u; x, r^2), a Gaussian, exactly;
+- x | u from p(x) N(u; x, r^2): the noise r is taken out of u in ancestral steps,
+  y' = D + (s' / s)^2 (y - D) + s' sqrt(1 - (s' / s)^2) n.
+
+| symbol | meaning | unit |
+|---|---|---|
+| x, u, y | targets on cells, clean, in between, noisy | brightness, 1 = white |
+| s, s', r | standard deviations of noise: now, after a step, between x and u | brightness |
+| z | coefficients of a `PatternPrior`, x = mean + patterns z + rest | standard deviations of the prior |
+| A, b | information [k, k] and score [k] that the measurement gives of z | |
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from evnlos.data import Capture, FixedPattern
+from evnlos.errors import ConfigError, UnknownNameError
+from evnlos.inverse import (
+    FrameTerm,
+    PatternPrior,
+    SequenceEstimate,
+    estimate_sequence,
+    record_of,
+    sequence_light,
+)
+from evnlos.inverse.event_images import COEFFICIENTS, event_prior
+from evnlos.inverse.sequence_light import SequenceLight
+from evnlos.machine import note
+from evnlos.models.unet import ResidualUNet, UNetConfig
+from evnlos.models.weights import weights_folders
+from evnlos.setups import Setup
+from evnlos.tensor_file import TensorFile
+from evnlos.types import Plane
+
+SPREAD = 0.5
+"""Standard deviation that inputs of the network are scaled by; of bright and dark cells in equal parts."""
+_FOLDER = "priors"
+_RATIO = 0.9  # of the noise after a step to that before it
+_FARTHEST, _NEAREST = 2.0, 0.05  # distance r at the first and at the last turns
+_TURNS, _AT_LAST = 24, 8  # turns on the way, and at the least distance
+_TOGETHER = 32  # samples that the network sees at a time
+_PATTERNS = 120  # of a target: all that a minute of a core allows where events are solved in full
+_GAP_S = 0.4  # between the instants at which silences are looked at
+_NORMAL_90 = 1.645
+_BESIDE = 0.02  # an interval of samples is widened by it: what is dark for sure is no interval of width 0
+_OPEN = 0.2
+
+
+@dataclass(frozen=True)
+class AboutPrior:
+    """Description of a file of a learned prior."""
+
+    width: int
+    """Channels of the network at full resolution."""
+    cells: int
+    """Cells along a side of the targets."""
+    trained_on: str
+    """What targets it knows, in words."""
+    least_noise: float = 0.02
+    """Least and"""
+    most_noise: float = 10.0
+    """most noise that it has learned to take out, in brightness."""
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.width <= 512 and 4 <= self.cells <= 256):
+            raise ConfigError(
+                f"a prior of {self.width} channels on {self.cells} cells; give 1 to 512, and 4 to 256"
+            )
+        if not 0 < self.least_noise < self.most_noise < math.inf:
+            raise ConfigError(f"noise from {self.least_noise} to {self.most_noise}; give two ascending numbers")
+
+
+class LearnedPrior(nn.Module):
+    """The denoiser D of targets.
+
+    Args:
+        about: Its size, and what it knows.
+
+    Example:
+        >>> prior = LearnedPrior(AboutPrior(width=8, cells=16, trained_on="nothing"))
+        >>> prior(torch.zeros(2, 16, 16), torch.tensor([0.1, 1.0])).shape
+        torch.Size([2, 16, 16])
+    """
+
+    def __init__(self, about: AboutPrior) -> None:
+        super().__init__()
+        self.about = about
+        self.unet = ResidualUNet(2, UNetConfig(width=about.width, depth=2, blocks=1, shuffle=2))
+
+    def forward(self, noisy: Tensor, noise: Tensor) -> Tensor:
+        """Return the mean clean target, [B, h, w], 0..1.
+
+        Args:
+            noisy: Targets plus noise, [B, h, w].
+            noise: Standard deviation of the noise of each, [B], brightness.
+        """
+        size = noise[:, None, None, None]
+        scaled = noisy[:, None] / (size.square() + SPREAD**2).sqrt()
+        told = (size.log() / 4).expand_as(scaled)
+        return self.unet(torch.cat([scaled, told], dim=1))[:, 0]
+
+    @torch.no_grad()
+    def draw(self, noisy: Tensor, noise: float, generator: torch.Generator) -> Tensor:
+        """Return a sample of the clean targets behind noisy ones, [B, h, w], each of p(x) N(noisy; x, noise^2).
+
+        Args:
+            noisy: Targets plus noise, [B, h, w].
+            noise: Standard deviation of the noise, brightness.
+            generator: Of the steps.
+        """
+        least = self.about.least_noise
+        steps = max(1, math.ceil(math.log(max(noise / least, 1.0)) / -math.log(_RATIO)))
+        sizes = [noise * (least / noise) ** (k / steps) for k in range(steps)] if noise > least else [noise]
+        for size, after in zip(sizes, [*sizes[1:], 0.0], strict=True):
+            clean = torch.cat([self(part, torch.full((len(part),), size)) for part in noisy.split(_TOGETHER)])
+            kept = (after / size) ** 2
+            fresh = torch.randn(noisy.shape, generator=generator)
+            noisy = clean + kept * (noisy - clean) + after * math.sqrt(1 - kept) * fresh
+        return noisy
+
+
+def _built(about: AboutPrior, **tensors: Tensor) -> LearnedPrior:
+    prior = LearnedPrior(about)
+    flat, place = tensors["weights"].float(), 0
+    for value in prior.parameters():
+        if (end := place + value.numel()) > flat.numel():
+            break
+        value.data.copy_(flat[place:end].view_as(value))
+        place = end
+    count = sum(value.numel() for value in prior.parameters())
+    if flat.numel() != count:
+        raise ValueError(f"{flat.numel()} numbers for a network of {count}")
+    return prior.eval()
+
+
+PRIOR = TensorFile(
+    "evnlos-target-prior-1", ("weights",), AboutPrior, _built, "a learned prior", "the file of a learned prior"
+)
+"""Learned priors on disk: the parameters of the network in their order, as one array."""
+
+
+def save_prior(path: str | Path, prior: LearnedPrior) -> None:
+    """Write a learned prior, in half precision.
+
+    Args:
+        path: The file, NAME.safetensors.
+        prior: What is written.
+    """
+    numbers = torch.cat([value.detach().flatten() for value in prior.parameters()])
+    PRIOR.write(path, {"weights": numbers.half()}, prior.about)
+
+
+def load_prior(word: str | Path = "targets") -> LearnedPrior:
+    """Return a learned prior.
+
+    Args:
+        word: A file of `PRIOR`, or the name of one in the folder `priors` of installed weights.
+
+    Raises:
+        UnknownNameError: There is no such file or name.
+        DataError: It is damaged.
+    """
+    if Path(word).is_file():
+        return PRIOR.load(word, "")
+    known = {
+        path.stem: path for folder in weights_folders() for path in (folder / _FOLDER).glob("*.safetensors")
+    }
+    if str(word) not in known:
+        names = f"one of {', '.join(sorted(known))}" if known else "install evnlos-weights"
+        raise UnknownNameError(f"there is no learned prior {str(word)!r}; give a file, or {names}")
+    return PRIOR.load(known[str(word)], "")
+
+
+@dataclass(frozen=True, eq=False)
+class TargetLikelihood:
+    """What a measurement says of a target: exp(b^T z - z^T A z / 2), z its coefficients.
+
+    Args:
+        basis: What the coefficients belong to; what its patterns leave out is not measured.
+        information: A, [k, k].
+        score: b, [k].
+    """
+
+    basis: PatternPrior
+    information: NDArray[np.float64]
+    score: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, found: SequenceEstimate, basis: PatternPrior) -> TargetLikelihood:
+        """Return what an estimate says without its own Gaussian prior, which has variance 1."""
+        total = np.linalg.inv(found.covariance)
+        total = (total + total.T) / 2
+        return cls(basis, total - np.eye(len(found.z)), total @ found.z)
+
+
+def posterior_samples(
+    prior: LearnedPrior,
+    likelihood: TargetLikelihood,
+    count: int = 32,
+    seed: int = 0,
+) -> Tensor:
+    """Return targets that a measurement and a learned prior allow, float32 [count, h, w], 0..1.
+
+    Where they are alike the measurement tells the target; where they differ, each is drawn from what the prior
+    knows, and none is to be believed alone.
+
+    Args:
+        prior: What targets look like.
+        likelihood: What the measurement says; on the cells of the prior.
+        count: Samples.
+        seed: Of their noise; the same gives the same samples.
+
+    Raises:
+        ConfigError: The cells are not those of the prior, or `count` is below 1.
+    """
+    basis, cells = likelihood.basis, prior.about.cells
+    if count < 1:
+        raise ConfigError(f"{count} samples; give 1 or more")
+    if basis.target_plane.shape != (cells, cells):
+        raise ConfigError(f"targets on {basis.target_plane.shape} cells; the prior knows {cells} x {cells}")
+    generator = torch.Generator().manual_seed(seed)
+    size = np.sqrt(np.square(basis.patterns).sum(axis=0))
+    values, turned = np.linalg.eigh(likelihood.information / np.outer(size, size))
+    # of the data alone: in the frame of `axes` [n, k] a target x has precision l and score c about the mean
+    axes = torch.from_numpy(basis.patterns / size @ turned)
+    precision = torch.from_numpy(values).clamp_min(0.0)
+    score = torch.from_numpy(turned.T @ (likelihood.score / size))
+    mean = torch.from_numpy(basis.mean)
+    image = torch.full((count, cells, cells), float(basis.mean.mean()))
+    image += _FARTHEST * torch.randn(image.shape, generator=generator)
+    ratio = (_NEAREST / _FARTHEST) ** (1 / (_TURNS - 1))
+    distances = [_FARTHEST * ratio**k for k in range(_TURNS)] + _AT_LAST * [_NEAREST]
+    for k, distance in enumerate(distances):
+        note(f"draw targets, turn {k + 1} of {len(distances)}")
+        flat = image.flatten(1).double()
+        noise = torch.randn(flat.shape, generator=generator, dtype=torch.float64)
+        between = flat + distance * noise
+        seen, tighter = (flat - mean) @ axes, precision + distance**-2
+        told = (score + seen * distance**-2) / tighter + (noise @ axes) / tighter.sqrt()
+        between += (told - seen - distance * (noise @ axes)) @ axes.mT
+        image = prior.draw(between.float().view_as(image), distance, generator)
+    return image.clamp(0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class TargetEstimate:
+    """A target with its uncertainty.
+
+    Args:
+        plane: Its cells.
+        image: Its mean, float64 [h, w], brightness.
+        deviation: Standard deviation of each cell, [h, w].
+        low: Lower end of the 90 % interval of each cell, [h, w].
+        high: Upper end of it, [h, w].
+        expected_error: Mean squared error of a cell that the variances say.
+        seconds: Processor time that it took, the light path aside.
+        likelihood: What the measurement says, and what it shows of thresholds, leak and noise.
+        samples: Samples of the posterior, float32 [S, h, w], where the prior is learned.
+    """
+
+    plane: Plane
+    image: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    expected_error: float
+    seconds: float
+    likelihood: SequenceEstimate
+    samples: Tensor | None = None
+
+    @property
+    def open_share(self) -> float:
+        """Share of the cells whose interval is wider than a fifth of white: what stands there is a guess."""
+        return float((self.high - self.low > _OPEN).mean())
+
+
+def estimate_target(
+    capture: Capture,
+    setup: Setup,
+    evidence: Literal["frames", "events", "both"] = "both",
+    pattern: FixedPattern | None = None,
+    prior: LearnedPrior | None = None,
+    samples: int = 32,
+    lights: dict[Any, SequenceLight] | None = None,
+) -> TargetEstimate:
+    """Return the target of a capture whose motion is known, from the one likelihood of its whole sequence.
+
+    Args:
+        capture: The recording.
+        setup: Its setup, linear.
+        evidence: What the likelihood is made of.
+        pattern: Fixed pattern of the frame camera; None: an offset of each pixel is integrated out.
+        prior: A learned prior; None: the Gaussian of handwriting.
+        samples: Samples under a learned prior.
+        lights: Light of captures of one setup and motion, kept from call to call.
+
+    Raises:
+        ConfigError: The motion is unknown, or the event model states no law of its crossings.
+    """
+    if (motion := capture.motion) is None:
+        raise ConfigError(f"{capture.name}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
+    motion, size = motion.in_its_plane(), capture.info.target_size_m
+    basis = event_prior(setup, size, _PATTERNS if prior is None or evidence != "frames" else COEFFICIENTS)
+    times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
+    span, shape = (float(times[0]), float(times[-1])), (capture.events.height, capture.events.width)
+    lights, key = {} if lights is None else lights, (motion, span, shape, size, basis.count)
+    if key not in lights:
+        lights[key] = sequence_light(setup.seen_by(shape), basis, motion.position_m, span, shape)
+    light, frames, record, law, begun = lights[key], None, None, None, time.process_time()
+    if evidence != "events":
+        peak = float(capture.peak)
+        levels = capture.frames / peak if pattern is None else pattern.correct(capture.frames, peak)
+        values = np.asarray(levels, np.float64).reshape(len(levels), -1)
+        frames = FrameTerm(light, values, times, setup.frame_camera, pattern is not None, setup.frame_doubt)
+    if evidence != "frames":
+        law = setup.pixel.crossing_law(light.typical_dn)
+        if law is None:
+            raise ConfigError(
+                f"{capture.name}: the setup's event model states no law of its crossings; give one of kind "
+                "continuous, v2e, brownian or circuit, or --from frames"
+            )
+        record = record_of(capture.events, law, span, _GAP_S)
+    found = estimate_sequence(light, basis, law, record, frames)
+    image, deviation, error, drawn = found.image, found.deviation, found.expected_error, None
+    low, high = image - _NORMAL_90 * deviation, image + _NORMAL_90 * deviation
+    if prior is not None:
+        drawn = posterior_samples(prior, TargetLikelihood.of(found, basis), samples)
+        each = drawn.double().numpy()
+        image, deviation = each.mean(axis=0), each.std(axis=0, ddof=min(samples - 1, 1))
+        error = float(np.square(deviation).mean())
+        low, high = (np.quantile(each, part, axis=0) for part in (0.05, 0.95))
+        low, high = low - _BESIDE, high + _BESIDE
+    seconds = round(time.process_time() - begun, 1)
+    return TargetEstimate(basis.target_plane, image, deviation, low, high, error, seconds, found, drawn)
