@@ -1,6 +1,6 @@
 """What a learned prior adds to a Gaussian one, and whether its intervals hold, on targets that neither knows.
 
-    python benchmarks/learned_prior.py near
+    python benchmarks/learned_prior.py packages/evnlos-weights/src/evnlos_weights/near.yaml
 
 The light path is that of a setup, whose frames of one sequence say A and b of a target's coefficients; b is
 drawn exactly as the frames' noise has it, at the light of the setup and at less. Targets are letters by hands
