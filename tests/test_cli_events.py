@@ -496,3 +496,16 @@ def test_large_sensors_are_added_up(tmp_path: Path) -> None:
     events = random_events(20_000, width=1280, height=720)
     pictures = preview_images([events], summarise([events]), PreviewOptions(frames=3, side_px=320))
     assert {picture.shape for picture in pictures} == {(180 + 26, 320, 3)}
+
+
+def test_a_folder_in_place_of_a_recording_is_refused(tmp_path: Path, capsys, monkeypatch) -> None:
+    """`preview .` ended in a traceback."""
+    monkeypatch.chdir(tmp_path)
+    for words in (
+        ("preview", "."),
+        ("clean", ".", "--out", "e.h5"),
+        ("convert", ".", "--out", "e.h5"),
+        ("info", "."),
+    ):
+        assert ". is a folder; give a file in it" in fails(capsys, *words)
+    assert not left_in(tmp_path)

@@ -20,6 +20,7 @@ from evnlos.analysis.linearized import (
     linearized,
     scan_notes,
 )
+from evnlos.errors import MissingDependencyError
 from evnlos.machine import note
 from evnlos.setups import Setup
 from evnlos.types import aligned, derive_seed
@@ -277,7 +278,7 @@ class Verdict:
     """What to believe of a reconstruction: the same words in each command, on the page and in the files.
 
     Args:
-        wall: What the wall allows, whatever the method (`Identification.wall`); empty where it is unknown.
+        wall: What the wall allows (`Identification.wall`), or what is needed to know it; empty: unknown.
         recording: What this recording supports (`ConfidenceReport.verdict`), or why that can't be told.
         guessed: What the network draws without a measurement.
     """
@@ -302,13 +303,17 @@ def verdict_on(
         report: How far to believe the images, where that can be told.
         no_confidence: Why it can't be told.
     """
-    wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
+    try:
+        wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
+    except MissingDependencyError as error:  # handwriting is asked about; the images stand without the answer
+        wall = f"what the wall allows is not known: {error}"
     if report is None:
         return Verdict(wall, no_confidence or "", "how much of the image is guessed cannot be told")
     if not report.measured:
         return Verdict(wall, report.verdict, "the whole image is the network's guess")
-    guessed = "what the intervals leave open is the network's guess, from its training"
-    return Verdict(wall, report.verdict, guessed)
+    return Verdict(
+        wall, report.verdict, "what the intervals leave open is the network's guess, from its training"
+    )
 
 
 def result_at_noise(

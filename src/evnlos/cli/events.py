@@ -43,6 +43,7 @@ from evnlos.events.recording import CropOptions, Recording
 from evnlos.machine import Progress, ProgressBars, Step
 from evnlos.machine import counted as frames_counted
 from evnlos.types import Events, OutFile
+from evnlos.untrusted import no_file
 
 
 @dataclass(frozen=True)
@@ -305,8 +306,10 @@ class CleanCommand:
     """Print one JSON object."""
 
     def check_names(self) -> None:
-        """Refuse a recording that is not there."""
+        """Refuse a recording that is not there, or a folder."""
         check_files(self.file)
+        if self.file.is_dir():
+            raise UnfitWordsError(no_file(self.file))
 
     def run(self) -> None:
         """Look and clean, with a progress bar over the events of each."""

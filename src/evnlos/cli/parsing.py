@@ -225,7 +225,7 @@ def _lists() -> Any:
         if asked or not (is_list or get_origin(info.type) is dict):
             return None
         asked.append(info)  # by this rule; the usual ones answer
-        spec = ConstructorRegistry.get_primitive_spec(info)
+        spec: Any = ConstructorRegistry.get_primitive_spec(info)
         asked.pop()
         shown = getattr(spec, "str_from_instance", None)
         return shown and replace(spec, str_from_instance=lambda values: shown(values) or ["unset"])
