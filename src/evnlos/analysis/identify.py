@@ -305,15 +305,14 @@ def verdict_on(
     """
     try:
         wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
-    except MissingDependencyError as error:  # handwriting is asked about; the images stand without the answer
+    except MissingDependencyError as error:  # of handwriting; the images stand without the answer
         wall = f"what the wall allows is not known: {error}"
     if report is None:
         return Verdict(wall, no_confidence or "", "how much of the image is guessed cannot be told")
     if not report.measured:
         return Verdict(wall, report.verdict, "the whole image is the network's guess")
-    return Verdict(
-        wall, report.verdict, "what the intervals leave open is the network's guess, from its training"
-    )
+    guessed = "what the intervals leave open is the network's guess, from its training"
+    return Verdict(wall, report.verdict, guessed)
 
 
 def result_at_noise(
@@ -374,11 +373,7 @@ def _psnr(error: torch.Tensor) -> float:
 
 
 def setup_table(found: Sequence[Identification]) -> str:
-    """Return an aligned table with one row per setup, between lines that say what holds for all of them.
-
-    Args:
-        found: The setups, all with the same settings.
-    """
+    """Return an aligned table of setups with the same settings, between lines that hold for all of them."""
     first, settings = found[0], found[0].settings
     rows = [["setup", "modes > 1e-2", "patterns", "bars, upright x lying, mm", "best linear image, dB"]]
     for one in found:
