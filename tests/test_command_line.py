@@ -327,3 +327,18 @@ def test_the_answer_to_a_missing_out_is_the_whole_cure(
     with pytest.raises(SystemExit):  # and with it the same is said, before anything is opened
         main(["events", *words.split(), "--out", "e.h5"])
     assert said.split("; ")[1] in capsys.readouterr().err and not Path("e.h5").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no folder here in which nobody can make a file")
+@pytest.mark.parametrize("words", ["identify main-near --out", "simulate --out", "convert e.npz --out"])
+def test_a_place_where_nobody_can_write_is_refused_before_the_work(
+    words: str, tmp_path, monkeypatch, capsys
+) -> None:
+    """For root every place seemed to be writable, and half a minute of work was lost."""
+    monkeypatch.chdir(tmp_path)
+    write_events("e.npz", Events([1, 2], [0, 1], [0, 1], [1, 0], 2, 2))
+    with pytest.raises(SystemExit) as end:
+        main([*words.split(), "/proc/nope/o.h5"])
+    told = capsys.readouterr().err
+    assert end.value.code == 2 and told.count("\n") == 1
+    assert "/proc/nope/o.h5 cannot be written: /proc is not writable; give another place" in told

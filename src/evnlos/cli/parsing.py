@@ -16,6 +16,7 @@ import logging
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -333,11 +334,7 @@ def check_there(resolve: Callable[[Any], object], *words: str | Path) -> None:
 
 
 def check_files(*paths: Path) -> None:
-    """Refuse files that are not there; what may be a pattern of names is left to those who expand it.
-
-    Raises:
-        UnknownNameError: There is one.
-    """
+    """Refuse files that are not there; what may be a pattern of names is left to those who expand it."""
     for path in paths:
         if not (path.exists() or glob.has_magic(str(path))):
             raise UnknownNameError(no_file(path))
@@ -392,6 +389,10 @@ def _check_writable(path: Path) -> None:
         place = place.parent
     if place != path.absolute() and not place.is_dir():
         raise ConfigError(f"{path} cannot be made: {place} is a file; give another place")
-    is_fixed = hasattr(os, "statvfs") and os.statvfs(place).f_flag & os.ST_RDONLY  # which root's rights hide
-    if is_fixed or not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)):
-        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another place")
+    try:
+        if place.is_dir():  # rights alone do not tell: root has all of them on a disk that is read-only, too
+            tempfile.TemporaryFile(dir=place).close()
+        elif not os.access(place, os.W_OK):
+            raise PermissionError
+    except OSError:
+        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another place") from None
