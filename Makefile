@@ -39,9 +39,9 @@ bench: $(READY)
 dist: $(READY)
 	$(BIN)/python tools/distributions.py --out dist
 
-# The wheel where nothing but its declared dependencies is: no extra, nothing of development.
+# The wheels of package and weights where nothing but declared dependencies is: no extra, nothing of development.
 declared: $(READY)
-	$(BIN)/python tools/distributions.py --core --out build/declared/dist --environment build/declared/venv
+	$(BIN)/python tools/distributions.py --out build/declared/dist --environment build/declared/venv
 	build/declared/venv/bin/python -I tests/declared.py
 
 clean:

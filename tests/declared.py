@@ -1,4 +1,4 @@
-"""Use the package with nothing but its declared dependencies: rooms, README, a command of each verb.
+"""Use package and published weights with no more than they declare: rooms, README, a command of each verb.
 
     make declared     # makes that environment (tools/distributions.py) and runs this in it
 
@@ -21,6 +21,7 @@ import tempfile
 import time
 import tomllib
 import traceback
+from dataclasses import replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -52,6 +53,8 @@ capture init begun --camera davis346
 capture check captures/lab_icon_000
 import captures/lab_icon_000 captures/lab_icon_001 --out recorded --test lab_icon_001 {{sampling}}
 reconstruct captures/lab_icon_000 --weights fused --out images
+reconstruct near/lab_icon_000 --weights near-frame-sequence --out published
+live near/lab_icon_000 --weights near-event --headless --out streamed --speed 8
 live captures/lab_icon_000 --weights fused --headless --out watched --speed 8
 track captures/lab_icon_000 --json
 invert captures/lab_icon_000 --setup small.yaml --solver tikhonov --columns 24 --cells 8 --out solved.png
@@ -186,6 +189,8 @@ def material() -> None:
     glyphs = DrawingGlyphs(kinds=("icon",), each=2)
     lab = Lab(glyphs=glyphs, setup=load_setup("small.yaml"), frame_rate_hz=1.0)  # type: ignore[arg-type]
     render_captures(lab, Path("captures"), workers=1)
+    one = DrawingGlyphs(kinds=("icon",), each=1)  # before a wall that the published weights know
+    render_captures(replace(lab, glyphs=one, setup=load_setup("main-near")), Path("near"), workers=1)
     Path("video").mkdir()
     bars = 120 + 100 * np.sign(np.sin(np.arange(32) / 3))
     for k in range(20):

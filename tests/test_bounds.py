@@ -1,5 +1,6 @@
 """Bounds of a moving target: the closed forms against dense algebra and drawn noise, and their laws."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -256,6 +257,13 @@ def test_bounds_of_a_setup() -> None:
         )
     table = found.table()
     assert table.count("\n| events,") == 4 and found.summary()["frames_db"] == found.frames_db
+    shown = found.table(in_columns=True)
+    rows, ends = shown.splitlines()[:-1], set()
+    for row in rows:
+        ends.add(re.search(r"  (?=[\d.]+(  |$))", row).start())
+    assert "|" not in shown and len(ends) == 1 and len(rows) == 2 + 2 * 4  # columns, for a terminal
+    for cell in re.findall(r"[\d.]+(?= \|)", table):
+        assert cell in shown
 
 
 def test_a_record_knows_where_each_event_is_measured_from() -> None:

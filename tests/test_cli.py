@@ -313,7 +313,11 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
     assert "Unrecognized options: --prot, 3; Perhaps you meant: --port INT" in fails(
         capsys, "app", "--prot", "3"
     )
-    assert "Missing from evnlos simulate: --out PATH; see" in fails(capsys, "simulate")
+    told = fails(capsys, "simulate")
+    assert (
+        "Missing from evnlos simulate: --out PATH (Folder of the dataset; " in told
+        and "e.g. --out result;" in told
+    )
     for flag, command in (("--start", ["calibrate", "c"]), ("--setup.pixel", ["simulate"])):  # groups of flags
         told = fails(capsys, *command, "--out", out, flag, "nope")
         assert f"Unrecognized options: {flag}, nope; Perhaps you meant: {flag}." in told and len(told) < 240

@@ -496,3 +496,28 @@ def test_large_sensors_are_added_up(tmp_path: Path) -> None:
     events = random_events(20_000, width=1280, height=720)
     pictures = preview_images([events], summarise([events]), PreviewOptions(frames=3, side_px=320))
     assert {picture.shape for picture in pictures} == {(180 + 26, 320, 3)}
+
+
+def test_a_folder_in_place_of_a_recording_is_refused(tmp_path: Path, capsys, monkeypatch) -> None:
+    """`preview .` ended in a traceback."""
+    monkeypatch.chdir(tmp_path)
+    for words in (
+        ("preview", "."),
+        ("clean", ".", "--out", "e.h5"),
+        ("convert", ".", "--out", "e.h5"),
+        ("info", "."),
+    ):
+        assert ". is a folder; give a file in it" in fails(capsys, *words)
+    assert not left_in(tmp_path)
+
+
+def test_what_a_damaged_array_lacks_is_named(tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("cut.npy", np.zeros((9, 40, 60), np.uint8))
+    Path("cut.npy").write_bytes(Path("cut.npy").read_bytes()[:4000])
+    said = fails(capsys, "events", "cut.npy", "--fps", 5, "--out", "e.h5")
+    assert "cut.npy: no array of numbers (mmap length is greater than file size)" in said
+    np.savez("float.npz", t=np.array([0.1, np.nan]), x=[1, 2], y=[1, 2], p=[1, 0])
+    said = fails(capsys, "convert", "float.npz", "--out", "e.h5")
+    assert "array t has dtype float64; give whole numbers, times in microseconds" in said
+    assert left_in(tmp_path) == {"cut.npy", "float.npz"}

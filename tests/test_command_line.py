@@ -1,5 +1,6 @@
 """The habits of the command line: completion, log levels, JSON on stdout, documented variables."""
 
+import contextlib
 import json
 import logging
 import os
@@ -9,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import evnlos
@@ -92,7 +94,7 @@ def test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows(encoding
     for words, said in (
         (("--port", "abc"), "--port is 'abc'; give a whole number"),
         (("--prot", "3"), "Unrecognized options: --prot, 3; Perhaps you meant: --port INT"),
-        (("one", "two"), "one, two: app takes no more of these; give one at a time"),
+        (("one", "two"), "one, two: app takes no more words without a flag; give one at a time"),
         (("--port",), "Missing value for argument '--port'. Expected 1 values"),
     ):
         done = subprocess.run(
@@ -283,3 +285,60 @@ def test_what_is_refused_is_told_alone_and_changes_nothing(
     told = capsys.readouterr()
     assert end.value.code == 2 and told.err.count("\n") == 1 and said in told.err and not told.out
     assert {path.name for path in tmp_path.rglob("*") if data not in path.parents} == {"notes", "data", "lab_A"}
+
+
+def test_a_list_that_may_be_left_out_says_so_in_the_help(capsys) -> None:
+    for verb in VERBS:
+        with contextlib.suppress(SystemExit):
+            main([verb, "--help"])
+        shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert "(default: )" not in shown, verb
+        assert verb not in ("identify", "fetch", "lab") or "(default: unset)" in shown, verb
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            "vid v.npy",
+            "; vid is a folder; several files are the images of one video: give one video, or a folder",
+        ),
+        ("v.npy", "; v.npy: its frames carry no times; give --fps; see"),
+        ("vid", "; vid/v.npy: its frames carry no times; give --fps; see"),
+        ("nowhere.mp4", "; nowhere.mp4: no such file; check the path; see"),
+    ],
+)
+def test_the_answer_to_a_missing_out_is_the_whole_cure(
+    words: str, said: str, tmp_path, monkeypatch, capsys
+) -> None:
+    """It named --out alone, and the next answers the folder, then the missing times."""
+    monkeypatch.chdir(tmp_path)
+    Path("vid").mkdir()
+    for name in ("v.npy", "vid/v.npy"):
+        np.save(name, np.zeros((3, 4, 6), np.uint8))
+    with pytest.raises(SystemExit) as end:
+        main(["events", *words.split()])
+    told = capsys.readouterr().err
+    assert end.value.code == 2 and told.count("\n") == 1 and said in told
+    assert (
+        "--out PATH (The event file; its ending says the format: .h5, " in told
+        and "e.g. --out result.h5" in told
+    )
+    with pytest.raises(SystemExit):  # and with it the same is said, before anything is opened
+        main(["events", *words.split(), "--out", "e.h5"])
+    assert said.split("; ")[1] in capsys.readouterr().err and not Path("e.h5").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no folder here in which nobody can make a file")
+@pytest.mark.parametrize("words", ["identify main-near --out", "simulate --out", "convert e.npz --out"])
+def test_a_place_where_nobody_can_write_is_refused_before_the_work(
+    words: str, tmp_path, monkeypatch, capsys
+) -> None:
+    """For root every place seemed to be writable, and half a minute of work was lost."""
+    monkeypatch.chdir(tmp_path)
+    write_events("e.npz", Events([1, 2], [0, 1], [0, 1], [1, 0], 2, 2))
+    with pytest.raises(SystemExit) as end:
+        main([*words.split(), "/proc/nope/o.h5"])
+    told = capsys.readouterr().err
+    assert end.value.code == 2 and told.count("\n") == 1
+    assert "/proc/nope/o.h5 cannot be written: /proc is not writable; give another place" in told

@@ -3,6 +3,7 @@
 import copy
 import json
 import shutil
+import sys
 from dataclasses import asdict, replace
 from html import unescape
 
@@ -17,7 +18,7 @@ from evnlos.app.views import verdict_box
 from evnlos.cli import main
 from evnlos.config import load_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
-from evnlos.errors import DataError
+from evnlos.errors import DataError, MissingDependencyError
 from evnlos.machine import Step
 from evnlos.models import (
     ConfidenceReport,
@@ -401,3 +402,15 @@ def test_keeping_the_most_supported_first() -> None:
     kept, risk = risk_coverage([0.2, 0.9, 0.5, 0.7], [0.8, 0.1, 0.5, 0.2])
     np.testing.assert_allclose(kept, [0.25, 0.5, 0.75, 1])
     np.testing.assert_allclose(risk, [0.1, 0.15, 0.8 / 3, 0.4])
+
+
+def test_a_verdict_without_fonts_says_what_to_install(monkeypatch) -> None:
+    """`reconstruct` and `live` ended in an error, after all their work, on an installation without extras."""
+
+    def no_fonts(*_):
+        raise MissingDependencyError("no font family; pip install evnlos[fonts] brings open ones")
+
+    monkeypatch.setattr(sys.modules[verdict_on.__module__], "identify", no_fonts)
+    said = verdict_on(load_setup("main-near"), None, "too few frames")
+    assert said.wall.startswith("what the wall allows is not known: no font family; pip install evnlos[fonts]")
+    assert said.recording == "too few frames"

@@ -151,7 +151,7 @@ def test_times_that_are_no_seconds(wrong, tmp_path):
     put(tmp_path / "a.h5", "events", small(), seconds=True)
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         file["events/t"][3] = wrong
-    with pytest.raises(EventFileError, match="events/t holds no times in seconds"):
+    with pytest.raises(EventFileError, match="events/t holds NaN or no times; mend them"):
         read_events(tmp_path / "a.h5")
 
 

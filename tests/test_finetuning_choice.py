@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from evnlos.cli import main
 from evnlos.config import config_hash, from_dict, to_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
 from evnlos.errors import ConfigError, DataError
@@ -207,3 +208,25 @@ def test_few_captures_tell_no_symmetry(tmp_path) -> None:
 def test_asymmetry_tells_a_camera_two_centimetres_off(offset_y_m, is_symmetric, tmp_path) -> None:
     found = asymmetry(captured(tmp_path / "d", offset_y_m))
     assert (found <= MOST_ASYMMETRY) == is_symmetric, found
+
+
+@pytest.mark.parametrize("done", [0, 1])
+def test_a_failed_choice_says_what_it_leaves(
+    done, tiny_dataset, pretrained, tmp_path, monkeypatch, capsys
+) -> None:
+    trained = list[Path]()
+
+    def failing(dataset, settings, out, *rest):
+        if len(trained) == done:
+            out.mkdir(parents=True)
+            raise DataError("the captures are odd")
+        trained.append(out)
+        return train(dataset, settings, out, *rest)
+
+    monkeypatch.setattr("evnlos.training.choice.train", failing)
+    words = ["--weights", str(pretrained), "--data", str(tiny_dataset.folder), "--out", str(tmp_path / "run")]
+    with pytest.raises(SystemExit) as end:
+        main(["finetune", "--choose", "--epochs", "1", *words])
+    told, trials = capsys.readouterr().err.splitlines()[-1], tmp_path / "run-trials"
+    assert end.value.code == 2 and "the captures are odd" in told and trials.exists() is bool(done)
+    assert (f"{trials} keeps what is trained: run the command again" in told) is bool(done)

@@ -15,7 +15,9 @@ from evnlos.cli import main
 from evnlos.errors import ConfigError
 from evnlos.machine import ProgressBars, Step, _duration, note, show_progress
 from evnlos.models import UNetConfig, Weights
+from evnlos.optics import dense_matrix
 from evnlos.setups import load_setup
+from evnlos.types import Plane
 
 
 @pytest.fixture(autouse=True)
@@ -272,3 +274,25 @@ def test_a_short_video_is_worked_on_after_its_last_frame(tmp_path, monkeypatch, 
     words = [str(tmp_path / "clip.npy"), "--fps", "30", "--out", str(tmp_path / "e.h5")]
     main(["events", *words, "--progress", "lines"])
     assert "e.h5: 5 frames (their events" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["easy-near", "main-near", "worn"])
+def test_a_light_path_counts_what_is_done(name: str, monkeypatch) -> None:
+    """It stood there as "light path" for as long as it took."""
+    noted = list[str]()
+    monkeypatch.setattr("evnlos.optics.radiometric.note", noted.append)
+    dense = load_setup(name).operator(Plane(6, 6, 0.013), (25, 40)).dense()
+    assert (
+        len(noted) >= 15
+        and noted[0] == "light path, 0 of 1000 pixels"
+        and noted[1] == "light path, 64 of 1000 pixels"
+    )
+    monkeypatch.setattr("evnlos.optics.radiometric._PARTS", 1)
+    assert torch.equal(dense, load_setup(name).operator(Plane(6, 6, 0.013), (25, 40)).dense())
+
+
+def test_a_matrix_found_column_by_column_counts_them(monkeypatch) -> None:
+    noted = list[str]()
+    monkeypatch.setattr("evnlos.optics.operator.note", noted.append)
+    dense_matrix(lambda image: 2.0 * image, torch.zeros(20, 20))
+    assert noted == ["light path, 0 of 400 cells", "light path, 256 of 400 cells"]

@@ -12,6 +12,8 @@ import pytest
 import yaml
 
 from evnlos.cli import VERBS, main
+from evnlos.cli.main import command_of
+from evnlos.cli.parsing import parse
 from evnlos.config import from_dict
 from evnlos.data import CaptureInfo, Simulation
 from test_cli_events import moving_bar
@@ -91,6 +93,40 @@ def test_the_commands_of_the_events_door_run(tmp_path, monkeypatch, capsys) -> N
     for words in commands:
         main(words)
     assert {path.name for path in tmp_path.iterdir()} == {"clip.mp4", "events.h5", "events.gif"}
+
+
+@pytest.mark.slow
+def test_the_commands_to_a_reconstructed_letter_run(tmp_path, monkeypatch, capsys) -> None:
+    """As they are written; and a published network reconstructs the same capture."""
+    monkeypatch.chdir(tmp_path)
+    text = TEXT[TEXT.index("**a reconstructed letter**") :]
+    lines = re.search(r"(?:^    .*\n)+", text, flags=re.MULTILINE)[0].strip().splitlines()
+    assert lines[0].strip().startswith("pip install") and "evnlos-weights" in lines[0]
+    commands = [shlex.split(line)[1:] for line in lines[1:]]
+    assert [words[0] for words in commands] == ["lab", "invert", "identify"]
+    for words in commands:
+        main(words)
+    shown = capsys.readouterr().out
+    decibel = re.search(r"^ +40 +([\d.]+) dB +([\d.]+) dB$", shown, flags=re.MULTILINE)
+    assert float(decibel[1]) > 18 and float(decibel[2]) > 18.5 and "patterns can be distinguished" in shown
+    main(["reconstruct", "captures/lab_R", "--weights", "near-frame-sequence", "--out", "learned"])
+    assert float(re.search(r"psnr_db ([\d.]+)", capsys.readouterr().out)[1]) > 20
+    assert {"result.png", "summary.json"} <= {path.name for path in Path("learned").iterdir()}
+
+
+def test_the_commands_behind_the_figures_are_whole() -> None:
+    """Their words fit what the commands take; they need hours, so that only their words are read."""
+    text = TEXT[TEXT.index("## What it measures") : TEXT.index("## In Python")]
+    lines = re.findall(r"^    evnlos (.*)$", text, flags=re.MULTILINE)
+    assert [line.split()[0] for line in lines] == ["experiment", "experiment", "identify"]
+    for line in lines:
+        verb, *words = shlex.split(line)
+        command = parse(command_of(verb), words, verb)
+        if verb == "experiment":
+            command.check_names()
+            assert command.captures == Path("captures") and command.captures_of == "near"
+        else:
+            assert command.bounds and all((ROOT / name).exists() for name in command.setups)
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="no make here")

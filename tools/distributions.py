@@ -2,15 +2,15 @@
 
     python tools/distributions.py --out dist                                # sdist, wheel, wheel of the weights
     python tools/distributions.py --out dist --release                      # the same, of a commit with a tag
-    python tools/distributions.py --out build/declared/dist --core --environment build/declared/venv
+    python tools/distributions.py --out build/declared/dist --environment build/declared/venv
 
 The version is that of the git tag. The wheel is built from the sdist, so that it shows what the sdist lacks.
 Sizes, names, metadata and the sums of the weights are checked, and SHA256SUMS is written beside the files. A
 release also needs a clean checkout with a tag, a dated heading in the changelog, the version in CITATION.cff
 and files of that version in tests/upgrade.
 
-An environment is a fresh virtual one that holds the wheel and what its dependencies name, with what these name
-in turn; nothing of an extra, nothing of development. The packages are those of the Python that runs this,
+An environment is a fresh virtual one that holds the wheels and what their dependencies name, with what these
+name in turn; nothing of an extra, nothing of development. The packages are those of the Python that runs this,
 linked file by file, without an index.
 """
 
@@ -194,8 +194,8 @@ def closure(requirements: list[str]) -> dict[str, importlib.metadata.Distributio
     return found
 
 
-def make_environment(wheel: Path, folder: Path) -> list[str]:
-    """Make the environment anew, install the wheel, and return what else is in it."""
+def make_environment(wheel: Path, folder: Path, *others: Path) -> list[str]:
+    """Make the environment anew, install the wheel and what needs only it, return what else is there."""
     shutil.rmtree(folder, ignore_errors=True)
     venv.create(folder, with_pip=False, symlinks=True)
     python = folder / "bin" / "python"
@@ -219,7 +219,8 @@ def make_environment(wheel: Path, folder: Path) -> list[str]:
             except OSError:
                 shutil.copy2(file.locate(), target)
     pip = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check"]
-    subprocess.run([*pip, "install", "--quiet", "--no-index", "--no-deps", "--no-compile", wheel], check=True)
+    install = ["install", "--quiet", "--no-index", "--no-deps", "--no-compile", wheel, *others]
+    subprocess.run([*pip, *install], check=True)
     subprocess.run([*pip, "check"], check=True)
     _take_compiled(site)
     return sorted(f"{name} {one.version}" for name, one in needed.items())
@@ -249,15 +250,17 @@ def main() -> None:
     asked.out.mkdir(parents=True)
     sdist, wheel = build_core(asked.out, version)
     check_core(sdist, wheel, version)
+    others = []
     if not asked.core:
         with tempfile.TemporaryDirectory() as folder:
             copy = shutil.copytree(WEIGHTS, Path(folder) / "weights")
-            check_weights(built("wheel", copy, asked.out))
+            others.append(built("wheel", copy, asked.out))
+        check_weights(others[0])
     write_sums(asked.out)
     for one in sorted(asked.out.iterdir()):
         print(f"{one}: {one.stat().st_size / 1e6:.2f} MB")
     if asked.environment is not None:
-        print(f"{asked.environment}: {', '.join(make_environment(wheel, asked.environment))}")
+        print(f"{asked.environment}: {', '.join(make_environment(wheel, asked.environment, *others))}")
 
 
 if __name__ == "__main__":

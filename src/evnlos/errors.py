@@ -1,6 +1,9 @@
-"""The errors that bad input raises: one sentence with the value, the limit and the cure."""
+"""The errors that bad input raises, one sentence with value, limit and cure, and how texts are printed."""
 
+import logging
 import re
+import sys
+from typing import Any, TextIO
 
 _UNSEEN = "\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff"
 _CONTROLS = re.compile(f"[{_UNSEEN}]")
@@ -24,6 +27,37 @@ def printable(text: object, *, lines: bool = False) -> str:
     """
     pattern = _CONTROLS_OF_LINES if lines else _CONTROLS
     return pattern.sub(lambda found: found[0].encode("unicode_escape").decode(), str(text))
+
+
+class StderrHandler(logging.Handler):
+    """Print each record on the stderr of the moment."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print it."""
+        print(printable(self.format(record), lines=True), file=sys.stderr)
+
+
+class PlainOutput:
+    """A stream without the control codes that names in a stranger's file may hold; line breaks and tabs stay.
+
+    Args:
+        stream: Where the text goes.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text."""
+        self._stream.write(printable(text, lines=True))
+        return len(text)
+
+    def flush(self) -> None:
+        """Write out what is held."""
+        self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 _OF_PYTHON = re.compile(r'(?:\b\w+=(?:"\w+"|\w+)?(?: and)? )+\(((?:--|evnlos )[^()]*)\)')

@@ -39,7 +39,7 @@ from evnlos.inverse.sequence_problem import position_subsets
 from evnlos.machine import note
 from evnlos.scene import LineMotion
 from evnlos.setups import Setup
-from evnlos.types import Plane
+from evnlos.types import Plane, aligned
 
 _GRID = (50, 80)  # pixels at which the sensor is looked at
 _REFERENCES = "AS2"  # characters that the prior does not know
@@ -154,29 +154,23 @@ class Bounds:
         """Return plain numbers."""
         return asdict(self)
 
-    def table(self) -> str:
-        """Return the expected PSNR over the number of positions, in Markdown."""
-        counts = self.settings.counts
-        rows = [
-            f"| {self.name}: expected PSNR, dB, of n positions | " + " | ".join(map(str, counts)) + " |",
-            "|---" * (1 + len(counts)) + "|",
-            _row("frames", self.frames_db),
-        ]
+    def table(self, in_columns: bool = False) -> str:
+        """Return the expected PSNR over the number of positions, in Markdown, or in columns for a terminal."""
+        named = [("frames", self.frames_db)]
         for one in self.events:
             what = f"{one.kind}, {100 * one.noise:.1f} %"
-            rows += [_row(f"events, {what}", one.events_db), _row(f"both, {what}", one.both_db)]
-        said = ", ".join(
-            f"{kind} {count:.2f}" for kind, count in {e.kind: e.per_pixel for e in self.events}.items()
+            named += [(f"events, {what}", one.events_db), (f"both, {what}", one.both_db)]
+        head = [f"{self.name}: expected PSNR, dB, of n positions", *map(str, self.settings.counts)]
+        rows = [head, *([name, *(f"{value:.1f}" for value in values)] for name, values in named)]
+        counts = {one.kind: f"{one.kind} {one.per_pixel:.2f}" for one in self.events}
+        remarks = (
+            f"Prior alone {self.prior_db:.2f} dB. Per cent: error of a crossing, log units. Crossings per "
+            f"pixel of the whole sequence: {', '.join(counts.values())}."
         )
-        rows.append(
-            f"\nPrior alone {self.prior_db:.2f} dB. Per cent: error of a crossing, log units. Crossings per "
-            f"pixel of the whole sequence: {said}."
-        )
-        return "\n".join(rows)
-
-
-def _row(name: str, values: tuple[float, ...]) -> str:
-    return f"| {name} | " + " | ".join(f"{value:.1f}" for value in values) + " |"
+        if in_columns:
+            return f"{aligned(rows)}\n{remarks}"
+        lines = [f"| {' | '.join(row)} |" for row in rows]
+        return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:], "", remarks])
 
 
 def sequence_bounds(

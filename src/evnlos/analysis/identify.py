@@ -20,6 +20,7 @@ from evnlos.analysis.linearized import (
     linearized,
     scan_notes,
 )
+from evnlos.errors import MissingDependencyError
 from evnlos.machine import note
 from evnlos.setups import Setup
 from evnlos.types import aligned, derive_seed
@@ -277,7 +278,7 @@ class Verdict:
     """What to believe of a reconstruction: the same words in each command, on the page and in the files.
 
     Args:
-        wall: What the wall allows, whatever the method (`Identification.wall`); empty where it is unknown.
+        wall: What the wall allows (`Identification.wall`), or what is needed to know it; empty: unknown.
         recording: What this recording supports (`ConfidenceReport.verdict`), or why that can't be told.
         guessed: What the network draws without a measurement.
     """
@@ -302,7 +303,10 @@ def verdict_on(
         report: How far to believe the images, where that can be told.
         no_confidence: Why it can't be told.
     """
-    wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
+    try:
+        wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
+    except MissingDependencyError as error:  # of handwriting; the images stand without the answer
+        wall = f"what the wall allows is not known: {error}"
     if report is None:
         return Verdict(wall, no_confidence or "", "how much of the image is guessed cannot be told")
     if not report.measured:
@@ -369,11 +373,7 @@ def _psnr(error: torch.Tensor) -> float:
 
 
 def setup_table(found: Sequence[Identification]) -> str:
-    """Return an aligned table with one row per setup, between lines that say what holds for all of them.
-
-    Args:
-        found: The setups, all with the same settings.
-    """
+    """Return an aligned table of setups with the same settings, between lines that hold for all of them."""
     first, settings = found[0], found[0].settings
     rows = [["setup", "modes > 1e-2", "patterns", "bars, upright x lying, mm", "best linear image, dB"]]
     for one in found:

@@ -43,6 +43,7 @@ _ANIMATIONS = (".gif", ".png", ".apng", ".webp")
 _BLOCK_BYTES = 1 << 25
 _BLOCK_FRAMES = 64
 _USUAL_FPS = 25.0
+_UNTIMED = "its frames carry no times; give fps= (--fps)"
 _LEAST, _MOST = 1e-3, 1e9  # of frame rate, slow motion and white
 
 
@@ -157,7 +158,7 @@ def open_video(
             f"{shown}: {source.frames} frame{'s' * (source.frames != 1)}; events need a video of at least two"
         )
     if fps is None and not source.timed:
-        raise DataError(f"{shown}: its frames carry no times; give fps= (--fps)")
+        raise DataError(f"{shown}: {_UNTIMED}")
     chosen = white or source.white or _white_of_floats(shown, source)
     width, height = _working_size(scale, source.size)
     return Video(shown, width, height, source.frames, fps, slow_motion, tone, chosen, source, colour=colour)
@@ -291,13 +292,36 @@ def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Pa
     return path, ContainerSource(path)
 
 
-def _named(paths: list[Path]) -> tuple[Path, PictureSource]:
+def check_paths(paths: Sequence[Path], fps: float | None) -> None:
+    """Refuse paths that are not one video, or of frames that carry no times, by their names alone.
+
+    Args:
+        paths: As of `open_video`.
+        fps: Frames per second, where they are stated.
+
+    Raises:
+        DataError: There is one.
+    """
+    first = paths[0]
+    if len(paths) > 1:
+        _check_images(paths)
+    inside = first.iterdir() if first.is_dir() else ()
+    images = len(paths) > 1 or any(one.suffix.lower() in _PICTURES for one in inside)
+    if fps is None and (images or first.suffix.lower() == ".npy"):
+        raise DataError(f"{first}: {_UNTIMED}")
+
+
+def _check_images(paths: Sequence[Path]) -> None:
+    cure = "several files are the images of one video: give one video, or a folder of videos"
     missing = [path for path in paths if not path.is_file()]
     if missing:
-        raise DataError(no_file(missing[0]))
+        raise DataError(f"{missing[0]} is a folder; {cure}" if missing[0].is_dir() else no_file(missing[0]))
     if other := next((path for path in paths if path.suffix.lower() not in _PICTURES), None):
-        cure = "several files are the images of one video: give one video, or a folder of videos"
         raise DataError(f"{other} is not an image; {cure}")
+
+
+def _named(paths: list[Path]) -> tuple[Path, PictureSource]:
+    _check_images(paths)
     paths = sorted(
         paths, key=lambda path: [int(s) if s.isdigit() else s for s in re.split(r"(\d+)", str(path))]
     )

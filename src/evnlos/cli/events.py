@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from evnlos.cameras.event_model import Phase, PixelSettings
 from evnlos.cameras.pixel import Logarithm, Mode
 from evnlos.cameras.sensors import load_pixel
-from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
-from evnlos.cli.parsing import check_files, refuse_existing, say
+from evnlos.cameras.video import Tone, Video, check_paths, check_video, open_video, video_events
+from evnlos.cli.parsing import UnfitWordsError, check_files, refuse_existing, say
 from evnlos.cli.recordings import (
     EventFile,
     Flat,
@@ -36,13 +36,14 @@ from evnlos.cli.recordings import (
     write_preview,
 )
 from evnlos.config import to_dict
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, DataError
 from evnlos.events import Cleaner, CleanOptions, EventWriter
 from evnlos.events.files.columns import OnError
 from evnlos.events.recording import CropOptions, Recording
 from evnlos.machine import Progress, ProgressBars, Step
 from evnlos.machine import counted as frames_counted
 from evnlos.types import Events, OutFile
+from evnlos.untrusted import no_file
 
 
 @dataclass(frozen=True)
@@ -146,20 +147,24 @@ class EventsCommand:
     """Print one JSON object."""
 
     def check_names(self) -> None:
-        """Refuse a video that is not there."""
+        """Refuse, before any is opened, paths that are not there, no one video, or frames without times."""
         check_files(*self.video)
+        try:
+            check_paths(_videos_in(self.video)[:1] or self.video, self.fps)
+        except DataError as error:
+            raise UnfitWordsError(str(error)) from None
 
     def run(self) -> None:
         """Simulate, with a progress bar over the frames, and print what came out."""
         if videos := _videos_in(self.video):
             if self.preview is not None:
                 raise ConfigError("--preview shows one video; leave it out for a folder of videos")
-            for video in videos:
-                out = self.out / f"{video.name}.h5"
+            for path in videos:
+                out = self.out / f"{path.name}.h5"
                 if out.exists() and not self.force:
                     say(f"{out}: there already")
                     continue
-                replace(self, video=(video,), out=out).run()
+                replace(self, video=(path,), out=out).run()
             return
         refuse_existing(self.force, self.out, *([self.preview] if self.preview else []))
         look = look_of(self.preview) if self.preview else None
@@ -301,8 +306,10 @@ class CleanCommand:
     """Print one JSON object."""
 
     def check_names(self) -> None:
-        """Refuse a recording that is not there."""
+        """Refuse a recording that is not there, or a folder."""
         check_files(self.file)
+        if self.file.is_dir():
+            raise UnfitWordsError(no_file(self.file))
 
     def run(self) -> None:
         """Look and clean, with a progress bar over the events of each."""

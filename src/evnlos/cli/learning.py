@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -22,7 +23,7 @@ from evnlos.cli.parsing import check_there, say, told_first
 from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, read_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
-from evnlos.errors import ConfigError, DataError, printable
+from evnlos.errors import ConfigError, DataError, EvnlosError, printable
 from evnlos.machine import ProgressBars
 from evnlos.models import (
     GENERIC,
@@ -155,7 +156,7 @@ class FinetuneCommand:
     choose: bool = False
     """Try these settings, a fifth and five times the learning rate, keeping the normalization and not, three
     times the epochs, the embedding fitted again and the first part of the network kept, on two halves of the
-    training captures in turn; take the best, part of the way to it, or nothing."""
+    training captures in turn; take the best, part of the way, or nothing. OUT-trials keeps them till then."""
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Training] = field(default_factory=finetuning)
@@ -169,13 +170,20 @@ class FinetuneCommand:
             return
         if known is not None:
             raise ConfigError("--choose tells by captures held out of --data; leave --captures away")
+        trials = self.out.with_name(f"{self.out.name}-trials")
         candidates = alternatives(self.settings, load_weights(self.weights).network)
-        with ProgressBars() as progress:
-            trained = choose_and_finetune(dataset, candidates, self.out, self.weights, progress=progress)
-        choice = read_choice(self.out)
-        assert choice is not None
-        values = {"run": str(self.out), "weights": str(trained.file), **asdict(choice)}
-        result(self.json, values, f"{self.out}: {choice.sentence()}; weights in {trained.file}")
+        try:
+            with ProgressBars() as progress:
+                trained = choose_and_finetune(dataset, candidates, self.out, self.weights, progress=progress)
+        except EvnlosError as error:
+            if any(trials.glob("*/weights.safetensors")):
+                cure = f"{trials} keeps what is trained: run the command again to go on, or delete it"
+                raise type(error)(f"{error}; {cure}") from None
+            shutil.rmtree(trials, ignore_errors=True)
+            raise
+        if (choice := read_choice(self.out)) is not None:
+            about = {"run": str(self.out), "weights": str(trained.file), **asdict(choice)}
+            result(self.json, about, f"{self.out}: {choice.sentence()}; weights in {trained.file}")
 
 
 @dataclass(frozen=True)
@@ -193,9 +201,8 @@ class EvaluateCommand:
     lpips_heads: Path | None = None
     """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
     setup: Path | None = None
-    """The setup of the data (the folder that `calibrate` wrote, a settings file, a room's name): the confidence
-    then asks how much of the frames the images explain. Without it weights take the setup that they were
-    trained for, where it is known."""
+    """The setup of the data (folder of `calibrate`, settings file, a room's name): how much of the frames the
+    images explain. By default the setup that the weights were trained for, where it is known."""
     positions: tuple[int, ...] = ()
     """Numbers of positions, e.g. 1 2 5 10 20 40: also how the image of a sequence network grows with them."""
     json: bool = False

@@ -30,7 +30,6 @@ from evnlos.cli.parsing import (
     PROGRESS_FLAG,
     QUIET_FLAG,
     VARIABLE,
-    PlainOutput,
     UnfitWordsError,
     check_names,
     check_out,
@@ -40,7 +39,7 @@ from evnlos.cli.parsing import (
     todays_words,
 )
 from evnlos.doctor import WORK_LIBRARIES, examine, fault_behind, without_work_libraries
-from evnlos.errors import ConfigError, EvnlosError, UnknownNameError, for_command_line, printable
+from evnlos.errors import ConfigError, EvnlosError, PlainOutput, UnknownNameError, for_command_line, printable
 from evnlos.machine import PROGRESS, SHOWN, sleep_while_waiting
 from evnlos.registry import Kinded, __version__, kind_of
 

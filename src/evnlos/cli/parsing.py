@@ -16,11 +16,20 @@ import logging
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, get_args, get_origin
 
-from evnlos.errors import ConfigError, MissingDependencyError, UnknownNameError, printable
+from evnlos.errors import (
+    ConfigError,
+    DataError,
+    MissingDependencyError,
+    StderrHandler,
+    UnknownNameError,
+    for_command_line,
+)
 from evnlos.machine import PROGRESS, SHOWN, Progress, Step, show_progress
 from evnlos.untrusted import no_file
 
@@ -35,36 +44,6 @@ LOG = logging.getLogger("evnlos")
 
 class UnfitWordsError(ConfigError):
     """A word of a command line is none that the command takes, or one that it needs is missing."""
-
-
-class _Stderr(logging.Handler):
-    """Print each record on the stderr of the moment."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print(printable(self.format(record), lines=True), file=sys.stderr)
-
-
-class PlainOutput:
-    """A stream without the control codes that names in a stranger's file may hold; line breaks and tabs stay.
-
-    Args:
-        stream: Where the text goes.
-    """
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        """Write a text."""
-        self._stream.write(printable(text, lines=True))
-        return len(text)
-
-    def flush(self) -> None:
-        """Write out what is held."""
-        self._stream.flush()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
 
 
 def say(text: str) -> None:
@@ -82,12 +61,7 @@ def drawn(path: Path, draw: Callable[[], object]) -> str | None:
 
 
 def told_first(notes: Callable[[], object], progress: Progress) -> Progress:
-    """Return a progress that tells notes before its first step: what is refused before the work is told alone.
-
-    Args:
-        notes: Says them.
-        progress: Takes the steps.
-    """
+    """Return a progress that tells notes before its first step: what is refused before it stands alone."""
     untold = [notes]
 
     def tell(step: Step) -> None:
@@ -132,9 +106,9 @@ def listen(arguments: list[str]) -> list[str]:
     show_progress(shown)
     if level.lower() not in LEVELS:
         raise ConfigError(f"{source} is {level!r}; give one of {', '.join(LEVELS)}")
-    for handler in [one for one in LOG.handlers if isinstance(one, _Stderr)]:
+    for handler in [one for one in LOG.handlers if isinstance(one, StderrHandler)]:
         LOG.removeHandler(handler)
-    LOG.addHandler(_Stderr())
+    LOG.addHandler(StderrHandler())
     LOG.setLevel(level.upper())
     return rest
 
@@ -209,17 +183,23 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
 
     said = io.StringIO()
     # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
-    config = (tyro.conf.AvoidSubcommands, tyro.conf.HelptextFromCommentsOff)
+    config, rules = (tyro.conf.AvoidSubcommands, tyro.conf.HelptextFromCommentsOff), _lists()
     try:
         with contextlib.redirect_stderr(said), _unwrapped(words):
-            found = tyro.cli(command, args=words, prog=f"evnlos {verb}", default=default, config=config)
+            prog = f"evnlos {verb}"
+            found = tyro.cli(command, args=words, prog=prog, default=default, config=config, registry=rules)
     except SystemExit as end:
         if not end.code:
             raise
         text = _plain(in_one_line(said.getvalue()))
+        lacks = _OUT.search(" ".join(said.getvalue().replace("│", " ").split()))
+        if lacks is not None and ";" not in text:
+            word = "result.h5" if ".h5" in lacks[1] else "result"
+            text += f" ({lacks[1]}), e.g. --out {word}"
+            text += _other_faults(command, [*words, "--out", word], verb, default)
         unknown = re.search(r"Unrecognized options: (--[\w.-]+|.*)", text)
         if unknown and not unknown[1].startswith("-"):
-            text = f"{unknown[1]}: {verb} takes no more of these; give one at a time"
+            text = f"{unknown[1]}: {verb} takes no more words without a flag; give one at a time"
         elif unknown and "Perhaps you meant" not in text:
             with contextlib.redirect_stdout(io.StringIO()) as page, contextlib.suppress(SystemExit):
                 tyro.cli(command, args=["--help"], default=default, config=config)
@@ -233,6 +213,38 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
     check_numbers(found, "")
     print(said.getvalue(), end="", file=sys.stderr)  # warnings, if there were any
     return found
+
+
+def _lists() -> Any:
+    """Return tyro's rules with one more: the default of a list of nothing is called so, and not left blank."""
+    from tyro.constructors import ConstructorRegistry
+
+    rules, asked = ConstructorRegistry(), list[Any]()
+
+    def named(info: Any) -> Any:
+        is_list = get_origin(info.type) is tuple and get_args(info.type)[-1:] == (...,)
+        if asked or not (is_list or get_origin(info.type) is dict):
+            return None
+        asked.append(info)  # by this rule; the usual ones answer
+        spec: Any = ConstructorRegistry.get_primitive_spec(info)
+        asked.pop()
+        shown = getattr(spec, "str_from_instance", None)
+        return shown and replace(spec, str_from_instance=lambda values: shown(values) or ["unset"])
+
+    rules.primitive_rule(named)
+    return rules
+
+
+_OUT = re.compile(r"Missing from [^:]*: --out PATH (.*?)\.? (?:[A-Z]|\(required)")  # and what it is, a sentence
+
+
+def _other_faults(command: type, words: list[str], verb: str, default: Any) -> str:
+    """Return what else a command finds wrong as soon as its words are whole."""
+    try:
+        getattr(parse(command, words, verb, default), "check_names", tuple)()
+    except (ConfigError, DataError) as error:
+        return f"; {for_command_line(error).partition('; see evnlos')[0]}"
+    return ""
 
 
 @contextlib.contextmanager
@@ -313,10 +325,6 @@ def check_names(words: list[str]) -> None:
 def check_there(resolve: Callable[[Any], object], *words: str | Path) -> None:
     """Have what resolves words refuse those that are no file or folder, and names of nothing.
 
-    Args:
-        resolve: Called with each word that is no path of anything.
-        words: The words.
-
     Raises:
         UnknownNameError: There is one.
     """
@@ -326,11 +334,7 @@ def check_there(resolve: Callable[[Any], object], *words: str | Path) -> None:
 
 
 def check_files(*paths: Path) -> None:
-    """Refuse files that are not there; what may be a pattern of names is left to those who expand it.
-
-    Raises:
-        UnknownNameError: There is one.
-    """
+    """Refuse files that are not there; what may be a pattern of names is left to those who expand it."""
     for path in paths:
         if not (path.exists() or glob.has_magic(str(path))):
             raise UnknownNameError(no_file(path))
@@ -385,6 +389,10 @@ def _check_writable(path: Path) -> None:
         place = place.parent
     if place != path.absolute() and not place.is_dir():
         raise ConfigError(f"{path} cannot be made: {place} is a file; give another place")
-    is_fixed = hasattr(os, "statvfs") and os.statvfs(place).f_flag & os.ST_RDONLY  # which root's rights hide
-    if is_fixed or not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)):
-        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another place")
+    try:
+        if place.is_dir():  # rights alone do not tell: root has all of them on a disk that is read-only, too
+            tempfile.TemporaryFile(dir=place).close()
+        elif not os.access(place, os.W_OK):
+            raise PermissionError
+    except OSError:
+        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another place") from None

@@ -339,7 +339,7 @@ class PreviewCommand:
 
     def run(self) -> None:
         """Read the file twice, to see how much it holds and to draw it, and write the image."""
-        out = self.out or Path(self.file.name).with_suffix(".gif")
+        out = self.out or Path(self.file.name or "events").with_suffix(".gif")
         refuse_existing(self.force, out)
         look = look_of(out, self.style, self.background, self.frames, self.window_ms, self.side)
         recording = self.reading.open(self.file, "salvage")

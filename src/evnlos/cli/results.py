@@ -352,7 +352,7 @@ class IdentifyCommand:
             for warning in one.warnings:
                 say(f"warning: {one.name}: {warning}")
         whole = "what a whole sequence of frames, of events, of both shows: --bounds (half a minute per setup)"
-        print("\n".join(f"\n{limit.table()}" for limit in limits.values()) or whole)
+        print("\n".join(f"\n{limit.table(in_columns=True)}" for limit in limits.values()) or whole)
         if self.out is not None:
             names = ["identify.json", *(Path(one).name for one in written if one)]
             print(f"{self.out}: {', '.join(names)}")

@@ -18,7 +18,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
-from evnlos.optics.radiometric import torchs_threads
+from evnlos.optics.radiometric import noted_rows, torchs_threads
 from evnlos.types import Plane
 
 Array = NDArray[np.float64]
@@ -538,10 +538,11 @@ def facet_matrix(
         shift = [(k + 0.5) / samples - 0.5 for k in (du, dv)]
         seen = seen_points(pose, shape, columns.ravel() + shift[0], rows.ravel() + shift[1], pixel_aspect)
         with torchs_threads():
-            fill_facets(
-                part, seen.points, seen.frames, seen.eyes, cells, source.pitch_m**2,
-                table.log_density, table.scale, table.step, table.matte, MASKING,
-            )  # fmt: skip
+            for here in noted_rows(len(out)):
+                fill_facets(
+                    part[here], seen.points[here], seen.frames[here], seen.eyes[here], cells, source.pitch_m**2,
+                    table.log_density, table.scale, table.step, table.matte, MASKING,
+                )  # fmt: skip
         if samples > 1:
             out += part / samples**2
     return out

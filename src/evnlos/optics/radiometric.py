@@ -12,6 +12,7 @@ from numba import config, njit, prange, set_num_threads
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
+from evnlos.machine import note
 from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.interpolation import gauss_points, points_for
 from evnlos.optics.operator import Patches, as_patches
@@ -186,6 +187,21 @@ def fill_matrix(
         for r in range(height):
             for c in range(width):
                 out[p, r * width + c] = total[r, c] * emission[r * width + c]
+
+
+_PARTS = 16  # of a light path, so that progress moves
+
+
+def noted_rows(pixels: int) -> Iterator[slice]:
+    """Yield the rows of a light path part by part, and note how many pixels are done.
+
+    Args:
+        pixels: How many there are.
+    """
+    size = max(64, math.ceil(pixels / _PARTS))
+    for start in range(0, pixels, size):
+        note(f"light path, {start} of {pixels} pixels")
+        yield slice(start, start + size)
 
 
 _CHUNK = 2**19  # pairs of wall point and target point evaluated at a time
@@ -432,20 +448,20 @@ def _fill(
     patches = as_patches(source)
     sub, weight = (np.array(values) for values in gauss_points(over_cell))
     width, height = patches.size_m
+    constants = (
+        wall_weight.numpy(),
+        patches.x_m + _number(offset_m[0]) + sub[:, None] * width,
+        patches.y_m + _number(offset_m[1]) + sub[:, None] * height,
+        weight,
+        emission.detach().flatten().double().numpy() * (width * height),
+        distance_m,
+        np.array(eye_m),
+        metal,
+        albedo,
+        np.array(exponent, dtype=np.float64),
+        np.array([corner for one in occluders for corner in one.vertices_m], np.float64).reshape(-1, 3),
+        np.cumsum([len(one.vertices_m) for one in occluders], dtype=np.int64),
+    )
     with torchs_threads():
-        fill_matrix(
-            matrix.numpy(),
-            wall.contiguous().numpy(),
-            wall_weight.numpy(),
-            patches.x_m + _number(offset_m[0]) + sub[:, None] * width,
-            patches.y_m + _number(offset_m[1]) + sub[:, None] * height,
-            weight,
-            emission.detach().flatten().double().numpy() * (width * height),
-            distance_m,
-            np.array(eye_m),
-            metal,
-            albedo,
-            np.array(exponent, dtype=np.float64),
-            np.array([corner for one in occluders for corner in one.vertices_m], np.float64).reshape(-1, 3),
-            np.cumsum([len(one.vertices_m) for one in occluders], dtype=np.int64),
-        )
+        for rows in noted_rows(len(matrix)):
+            fill_matrix(matrix.numpy()[rows], wall[:, rows].contiguous().numpy(), *constants)

@@ -27,6 +27,7 @@ from evnlos.lab import (
     texture,
 )
 from evnlos.optics import MatrixTransport
+from evnlos.optics.radiometric import noted_rows
 from evnlos.scene import Scene
 from evnlos.setups.base import Setup, stated_distance_m
 from evnlos.types import Plane
@@ -269,18 +270,10 @@ class RoomSetup(Setup):
             tx, ty, tz = self.lamp.place_m
             discs = np.array([[tx + ox, ty + oy, tz, self.lamp.body_m]])
         out = np.empty((shape[0] * shape[1], len(x)), np.float32)
-        fill_throughput(
-            out,
-            rays.point,
-            rays.frame,
-            rays.eye,
-            rays.share,
-            np.stack([x + ox, y + oy], axis=1),
-            emission,
-            self.distance_m,
-            self.reflection.table(),
-            discs,
-        )
+        places, table = np.stack([x + ox, y + oy], axis=1), self.reflection.table()
+        for here in noted_rows(len(out)):
+            seen = rays.point[here], rays.frame[here], rays.eye[here], rays.share[here]
+            fill_throughput(out[here], *seen, places, emission, self.distance_m, table, discs)
         return out
 
     def _light_path(self) -> RoomSetup:

@@ -262,7 +262,7 @@ class Hdf5Source:
     def _microseconds(self, seconds: NDArray) -> NDArray[np.int64]:
         """Return times in seconds as whole microseconds."""
         if not (np.abs(seconds) < 2**61 / 1e6).all():
-            raise unreadable(self.path, 0, f"{self._called('t_us')} holds no times in seconds", _CURE)
+            raise unreadable(self.path, 0, f"{self._called('t_us')} holds NaN or no times", "mend them")
         return np.rint(seconds.astype(np.float64) * 1e6).astype(np.int64)
 
     def _refuse_outside(self, name: str, values: NDArray, low: int, high: int) -> None:

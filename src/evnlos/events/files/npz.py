@@ -46,7 +46,10 @@ class _Member:
         size = int(np.prod(self.shape, dtype=object)) * self.dtype.itemsize
         if self.dtype.hasobject or self.dtype.kind not in "iub" or (fortran and len(self.shape) > 1):
             raise unreadable(
-                path, info.header_offset, f"array {self.name} has dtype {self.dtype}", "integers are read"
+                path,
+                info.header_offset,
+                f"array {self.name} has dtype {self.dtype}",
+                "give whole numbers, times in microseconds",
             )
         if (
             self._file.tell() + size != info.file_size
