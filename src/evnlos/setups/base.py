@@ -322,7 +322,7 @@ class Setup(Kinded, ABC):
 
         Images whose sides have the ratio of the sensor's are taken for its own, averaged.
         """
-        other = self.sensor.resized(shape).pixel_aspect
+        other = self.sensor.aspect_at(shape)
         is_own = abs(math.log(other / self.sensor.pixel_aspect)) < _SAME_ASPECT
         return self.resized(shape) if is_own else replace(self, sensor=SensorSize(*shape))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -97,18 +97,7 @@ class FittedSetup(Setup):
 
     def pose(self) -> Pose:
         """Return where camera, wall and target are."""
-        return Pose(
-            self.camera_distance_m,
-            self.camera_angle_deg,
-            self.camera_elevation_deg,
-            self.camera_roll_deg,
-            self.field_of_view_deg,
-            self.distortion,
-            self.distance_m,
-            self.target_offset_m,
-            self.travel_slope,
-            self.curvature_per_m,
-        )
+        return Pose(**{one.name: getattr(self, one.name) for one in fields(Pose)})
 
     def table(self) -> SlopeTable:
         """Return the density of the facets' slopes."""
@@ -163,7 +152,7 @@ class FittedSetup(Setup):
         """
         fitted = self.fitted()
         kind = np.float32 if dtype == torch.float32 else np.float64
-        aspect = self.sensor.resized(shape).pixel_aspect
+        aspect = self.sensor.aspect_at(shape)
         made = facet_matrix(self.pose(), self.table(), shape, source, kind, pixel_aspect=aspect)
         matrix = torch.from_numpy(made)
         matrix *= fitted.image("sensitivity", shape).flatten().to(matrix)[:, None]
@@ -295,7 +284,7 @@ class FittedSetup(Setup):
 
     def magnification_px_m(self, shape: tuple[int, int]) -> float:
         """Return an upper bound of the image motion, pixels per metre of the target's."""
-        return _magnification_px_m(self.pose(), shape, self.sensor.resized(shape).pixel_aspect)
+        return _magnification_px_m(self.pose(), shape, self.sensor.aspect_at(shape))
 
     def _along(self, shape: tuple[int, int]) -> tuple[MatrixTransport, Target] | None:
         """Return matrix and image of what moves along; None where nothing shines beside the target."""

@@ -96,7 +96,7 @@ class RadiometricSetup(Setup):
     def view(self, shape: tuple[int, int]) -> View:
         """Return the camera's view for an image of `shape` (H, W), pixels."""
         angle, fov = math.radians(self.camera_angle_deg), math.radians(self.field_of_view_deg)
-        aspect = self.sensor.resized(shape).pixel_aspect
+        aspect = self.sensor.aspect_at(shape)
         return View.perspective(shape, self.camera_distance_m, angle, fov, pixel_aspect=aspect)
 
     def target_cells(self) -> Plane:
