@@ -194,25 +194,10 @@ class Chain(Transport):
         return reduce(lambda image, step: step(image), self.steps, scene)
 
 
-class LinearChain(LinearTransport):
+class LinearChain(Chain, LinearTransport):
     """Linear transports applied one after the other; built by `compose`."""
 
-    def __init__(self, steps: tuple[LinearTransport, ...]) -> None:
-        self.steps = steps
-        self.source = steps[0].source
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Size of the last step's images."""
-        return self.steps[-1].shape
-
-    @property
-    def output(self) -> Plane | None:
-        """Plane of the last step."""
-        return self.steps[-1].output
-
-    def _forward(self, scene: torch.Tensor) -> torch.Tensor:
-        return reduce(lambda image, step: step(image), self.steps, scene)
+    steps: tuple[LinearTransport, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _adjoint(self, image: torch.Tensor) -> torch.Tensor:
         return reduce(lambda wall, step: step.adjoint(wall), reversed(self.steps), image)
