@@ -205,7 +205,6 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-SPLITS = ("train", "validation", "test")
 PAGE = "dataset.yaml"
 """Name of the file that describes a dataset, in its folder."""
 _DIGEST = "digest"

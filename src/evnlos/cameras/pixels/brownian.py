@@ -450,16 +450,6 @@ class BrownianPixel(ThresholdPixel):
             exposure=self.exposure,
         )
 
-    def drift_and_noise(self, light_dn: float) -> tuple[float, float]:
-        """Return the drift by leak, log units per s, and the noise, log units per sqrt(s), in constant light.
-
-        Args:
-            light_dn: Light at the pixel, DN.
-        """
-        drift = self.threshold_on * (self.leak_rate_hz + self.leak_rate_per_dn_hz * light_dn)
-        noise = self.photon_noise * math.sqrt(light_dn) / (light_dn + self.dark_dn) + self.dark_noise
-        return drift, noise
-
 
 class BrownianArray(TiledArray):
     """An array of `BrownianPixel`s."""
