@@ -238,6 +238,10 @@ def reduce_by_area(images: NDArray, shape: tuple[int, int]) -> NDArray[np.float3
 
     Each output pixel is the mean of the input over its cell; the mean of the image is kept.
 
+    Args:
+        images: Real images, [..., H, W].
+        shape: Rows and columns of the result, pixels.
+
     Example:
         >>> reduce_by_area(np.arange(6.0).reshape(1, 6), (1, 4)).round(2)
         array([[0.33, 1.67, 3.33, 4.67]], dtype=float32)
@@ -304,6 +308,9 @@ def split_of(names: list[str], test: list[str], validation: list[str]) -> dict[s
 
 def character_of(name: str) -> str:
     """Return what an object shows, from its name: the part behind the last underscore.
+
+    Args:
+        name: Name of an object or capture, e.g. "near_R".
 
     Example:
         >>> character_of("near_R"), character_of("writer03_A")

@@ -316,7 +316,11 @@ def gain_table(records: list[Record], arm: str = "EPNP") -> str:
 
 
 def checks_table(records: list[Record]) -> str:
-    """Return Markdown: shares of images that are recognized and that are no memory, and the confusion."""
+    """Return Markdown: shares of images that are recognized and that are no memory, and the confusion.
+
+    Args:
+        records: Records of a study.
+    """
     found: dict[tuple[str, str], list[Record]] = defaultdict(list)
     for record in records:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"

@@ -159,6 +159,9 @@ class LinearTransport(Transport):
 def compose(*transports: Transport) -> Transport:
     """Return the transport that applies the given ones in order; it is linear if all of them are.
 
+    Args:
+        transports: One or more; each takes images of the size that the one before makes.
+
     Raises:
         ConfigError: Nothing was given, or a transport makes images of another size than the next one takes.
     """

@@ -387,7 +387,14 @@ class OtherTarget:
 def with_others(
     scene: Scene, others: tuple[OtherTarget, ...], cover: bool, seed: int
 ) -> Scene | SeveralTargets:
-    """Return a scene with other targets beside its own, or itself where there are none."""
+    """Return a scene with other targets beside its own, or itself where there are none.
+
+    Args:
+        scene: The scene.
+        others: Targets beside its own, with motions of theirs.
+        cover: Whether a later target hides earlier ones.
+        seed: Seed of their drawing.
+    """
     drawn = [(one.glyphs.target(one.glyphs.objects()[0], seed), one.motion) for one in others]
     scenes = (scene, *(replace(scene, target=target, motion=motion) for target, motion in drawn))
     return SeveralTargets(scenes, cover) if others else scene
