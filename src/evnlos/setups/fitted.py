@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.config import BESIDE
 from evnlos.errors import ConfigError
+from evnlos.files import write_atomically
 from evnlos.optics import MatrixTransport, MatrixWall, coarsest_keyframe_step_m
 from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.facets import Pose, SlopeTable, facet_matrix, seen_points
 from evnlos.optics.wall import ambient_map, ambient_plane
 from evnlos.scene import Ink, Scene, Target
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
-from evnlos.setups.files import WALL, FittedWall
+from evnlos.setups.files import WALL, WALL_FILE, FittedWall
 from evnlos.setups.measured import covered
 from evnlos.types import Plane
 
@@ -94,6 +95,13 @@ class FittedSetup(Setup):
         if not self.file:
             raise ConfigError("setup.file is empty; give the .safetensors file of `evnlos calibrate`")
         return WALL.load(self.file, self.checksum)
+
+    def kept_in(self, folder: Path, **findings: Any) -> FittedSetup:
+        """Return the setup with the wall's file in a folder, and what was found."""
+        path = (folder / WALL_FILE).resolve()
+        if Path(self.file).resolve() != path:
+            write_atomically(path, Path(self.file).read_bytes())
+        return replace(self, file=str(path), **findings)
 
     def pose(self) -> Pose:
         """Return where camera, wall and target are."""
