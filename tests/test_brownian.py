@@ -35,10 +35,16 @@ def first_exits(events, pixels: int) -> tuple[np.ndarray, np.ndarray]:
     return events.t_us[first] * 1e-6, events.p[first]
 
 
+def drift_and_noise(pixel: BrownianPixel, light: float) -> tuple[float, float]:
+    """Return the leak's drift, log units per s, and the noise, log units per sqrt(s), in constant light, DN."""
+    drift = pixel.threshold_on * (pixel.leak_rate_hz + pixel.leak_rate_per_dn_hz * light)
+    return drift, pixel.photon_noise * math.sqrt(light) / (light + pixel.dark_dn) + pixel.dark_noise
+
+
 def reference(pixel: BrownianPixel, level: float, seconds: float, step_s: float, runs: int, seed: int):
     """Return first exit times and polarities of the equation in constant light, by small steps alone."""
     draw = np.random.default_rng(seed)
-    drift, noise = pixel.drift_and_noise(level)
+    drift, noise = drift_and_noise(pixel, level)
     x, time = np.zeros(runs), np.full(runs, np.nan)
     on = np.zeros(runs, bool)
     for k in range(round(seconds / step_s)):
@@ -86,7 +92,7 @@ def test_leak_intervals_are_inverse_gaussian() -> None:
     """Interval 1 / mu, coefficient of variation sigma / sqrt(mu): 0.0137 for a DAVIS346 at 250 DN."""
     frames, times = constant(250.0, 30.0, 300)
     events = sent(frames, times, BrownianPixel(), seed=2)
-    drift, noise = (value / 0.18993 for value in BrownianPixel().drift_and_noise(250.0))
+    drift, noise = (value / 0.18993 for value in drift_and_noise(BrownianPixel(), 250.0))
     order = np.lexsort((events.t_us, events.x))
     gaps = np.diff(events.t_us[order])[np.diff(events.x[order].astype(int)) == 0] * 1e-6
     assert events.p.all()
@@ -108,7 +114,7 @@ def test_noise_alone_has_its_rate_whatever_the_frame_distance(frames) -> None:
 def test_a_slow_reference_finds_the_same_first_exits() -> None:
     """Small steps see a barrier late by 0.583 sigma sqrt(step): 1 ms steps against thresholds moved by that."""
     pixel = BrownianPixel(0.2, 0.3, 0.0, 20.0, 0.4, 0.01, 0.9, 0.05, initial_phase="rest")
-    _, noise = pixel.drift_and_noise(60.0)
+    _, noise = drift_and_noise(pixel, 60.0)
     shift = 0.5826 * noise * math.sqrt(1e-3)
     moved = replace(pixel, threshold_on=0.2 - shift, threshold_off=0.3 - shift)
     moved = replace(moved, leak_rate_hz=0.4 * 0.2 / moved.threshold_on)

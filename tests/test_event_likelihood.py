@@ -15,7 +15,6 @@ from evnlos.cameras import CircuitPixel, EventPixel, FrameCamera, PixelSettings,
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, Simulation, capture_samples, read_capture, simulate
-from evnlos.data.sampling import surface_of
 from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse import (
     AboutErrors,
@@ -339,8 +338,6 @@ def test_the_surface_is_refused_without_setup_or_motion() -> None:
         event_images(events, edges, None, "near", canvas)
     with pytest.raises(UnknownNameError, match=r"'near'.*is not there: give the folder"):
         event_images(events, edges, BENCH.motion, "near", canvas)
-    with pytest.raises(ConfigError, match="whole recordings"):
-        surface_of(events, edges, Sampling(surface="likelihood", setup="near"))
 
 
 def test_what_samples_and_weights_must_share(tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from evnlos.scene import (
     fonts,
     list_emnist,
     list_sd19,
-    read_emnist,
-    read_sd19,
+    read_emnist_images,
+    read_sd19_image,
     render_glyph,
 )
 
@@ -194,14 +194,13 @@ def sd19(tmp_path):
 
 
 def test_sd19_is_read_upright_and_bright_on_dark(sd19):
-    found = list(read_sd19(sd19, "Al", "hsf_0"))
-    assert [(item.char, item.source) for item in found] == [
+    found = list(list_sd19(sd19, "Al", "hsf_0"))
+    assert [(char, source) for char, source, _ in found] == [
         (char, f"hsf_0_0000{number}") for char in "Al" for number in range(3)
     ]
-    np.testing.assert_array_equal(found[0].mask, character_image(128))
-    assert [item.source for item in read_sd19(sd19 / "by_class", "A", "train", first=1, count=1)] == [
-        "train_41_00001"
-    ]
+    np.testing.assert_array_equal(read_sd19_image(found[0][2]), character_image(128))
+    chosen = list_sd19(sd19 / "by_class", "A", "train", first=1, count=1)
+    assert [source for _, source, _ in chosen] == ["train_41_00001"]
 
 
 def test_sd19_says_what_is_missing(sd19):
@@ -211,12 +210,13 @@ def test_sd19_says_what_is_missing(sd19):
         list(list_sd19(sd19, "A", count=4))
     with pytest.raises(DataError, match="hsf_0 to hsf_8"):
         list(list_sd19(sd19, "A", partition="hsf_9"))
-    (sd19 / "by_class/41/hsf_0/hsf_0_00000.png").write_bytes(b"no image")
+    _, _, first = next(iter(list_sd19(sd19, "A")))
+    first.write_bytes(b"no image")
     with pytest.raises(DataError, match="no image"):
-        list(read_sd19(sd19, "A"))
-    Image.new("L", (2000, 10)).save(sd19 / "by_class/41/hsf_0/hsf_0_00000.png")
+        read_sd19_image(first)
+    Image.new("L", (2000, 10)).save(first)
     with pytest.raises(DataError, match="128 x 128"):
-        list(read_sd19(sd19, "A"))
+        read_sd19_image(first)
 
 
 def test_sd19_objects_become_targets(sd19):
@@ -242,15 +242,14 @@ def write_emnist(folder, labels=(10, 11, 10, 0), part="train", directory_lock=No
     return folder
 
 
+def read_emnist(folder, characters):
+    return dict(read_emnist_images(folder, [number for _, number in list_emnist(folder, characters)]))
+
+
 def test_emnist_is_turned_upright(tmp_path):
     folder = write_emnist(tmp_path / "e")
-    found = list(read_emnist(folder, "AB"))
-    assert [(item.char, item.source) for item in found] == [
-        ("A", "train_000000"),
-        ("B", "train_000001"),
-        ("A", "train_000002"),
-    ]
-    np.testing.assert_array_equal(found[0].mask, character_image(28))
+    assert list_emnist(folder, "AB") == [("A", 0), ("B", 1), ("A", 2)]
+    np.testing.assert_array_equal(read_emnist(folder, "AB")[0], character_image(28))
     assert list_emnist(folder, "A", first=1, count=1) == [("A", 2)]
 
 
@@ -275,16 +274,16 @@ def test_damaged_emnist_files_are_refused(tmp_path):
     whole = images.read_bytes()
     images.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"damaged|ends early"):
-        list(read_emnist(folder, "A"))
+        read_emnist(folder, "A")
     images.write_bytes(b"plain bytes")
     with pytest.raises(DataError, match="damaged"):
-        list(read_emnist(folder, "A"))
+        read_emnist(folder, "A")
     write_emnist(folder, directory_lock=3_000_000_000)
     with pytest.raises(DataError, match="promises"):
-        list(read_emnist(folder, "A"))
+        read_emnist(folder, "A")
     write_emnist(folder, directory_lock=5)
     with pytest.raises(DataError, match="ends early"):
-        list(read_emnist(folder, "A"))
+        read_emnist(folder, "A")
     (folder / "emnist-byclass-mapping.txt").write_text("ten A\n")
     with pytest.raises(DataError, match="mapping"):
         list_emnist(folder, "A")
@@ -300,7 +299,7 @@ def test_fuzzed_emnist_files_never_escape_as_another_error(tmp_path, seed):
             content[place] = rng.integers(0, 256)
         path.write_bytes(bytes(content))
     try:
-        list(read_emnist(folder, "A"))
+        read_emnist(folder, "A")
     except EvnlosError as error:
         assert "\n" not in str(error)
 

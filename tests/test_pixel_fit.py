@@ -1,7 +1,9 @@
 """`evnlos pixel fit`: an event pixel from recordings under known light, and what these do not tell."""
 
 import json
+import math
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -19,7 +21,6 @@ from evnlos.calibration import (
     fit_known_light,
     panels_of,
     pixel_at,
-    position_of,
     read_lit_events,
     read_manifest,
     refractory_of,
@@ -169,7 +170,8 @@ def test_the_scale_of_a_number_and_its_inverse() -> None:
         pixel = pixel_at(start, free, u)
         for k, one in enumerate(free):
             value = float(value_of(one, u[k]))
-            assert position_of(one, value) == pytest.approx(u[k], abs=1e-9)
+            low, high, at = (math.log(n) if one.log else n for n in (one.low, one.high, value))
+            assert NormalDist().inv_cdf((at - low) / (high - low)) == pytest.approx(u[k], abs=1e-9)
             if one.name != MISMATCH:
                 assert getattr(pixel, one.name) == pytest.approx(value)
 

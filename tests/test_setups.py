@@ -388,3 +388,20 @@ def test_the_paper_s_setup_of_before_loads(tmp_path: Path) -> None:
     found = load_yaml(Simulation, tmp_path / "old.yaml")
     assert found.setup == PaperSetup(field_step_m=1e-5, window=0.5, kernel_radius=6.0)
     assert found.vary == {"setup.kernel_radius": (2.0, 5.0)}
+
+
+def test_a_calibration_asks_any_setup_for_its_start_and_its_place(setup: Setup, tmp_path: Path) -> None:
+    begin = setup.wall_start()
+    assert (begin is not None) == (setup.kind == "radiometric")
+    if begin is not None:
+        pose, *roughness = begin
+        assert (pose.distance_m, pose.target_offset_m) == (setup.distance_m, setup.offset_m())
+        assert roughness == [setup.roughness, setup.roughness]
+    (folder := tmp_path / "calibrated").mkdir()
+    kept = setup.kept_in(folder, unexplained=0.1, frame_doubt=3.0)
+    if setup.kind == "fitted":
+        assert (kept.file, kept.unexplained, kept.frame_doubt) == (str(folder / "wall.safetensors"), 0.1, 3.0)
+        assert kept.kept_in(folder) == kept and kept.checksum == setup.checksum
+        assert torch.equal(kept.ambient_light(), setup.ambient_light())
+    else:
+        assert kept is setup and not list(folder.iterdir())

@@ -29,7 +29,7 @@ from evnlos.cli import main
 from evnlos.data import FixedPattern, Sampling, load_pattern, read_capture, save_pattern
 from evnlos.events import read_triggers
 from evnlos.models import UNetConfig, Weights, load_weights, save_weights
-from evnlos.scene.databases import read_sd19_image
+from evnlos.scene import read_sd19_image
 from evnlos.setups.files import (
     MEASUREMENT,
     WALL,

@@ -3,8 +3,8 @@
     python tools/train_prior.py packages/evnlos-weights/src/evnlos_weights/priors/targets.safetensors
 
 It learns from letters by many hands and in print, without A G K S 2 4 9, and from drawings, in grey too, each
-shifted, scaled, turned and slanted anew. Letters of hands 39 and above and drawings 0 to 99 of each kind are
-not among them (`benchmarks/learned_prior.py` asks for these).
+shifted, scaled, turned, slanted, bent, thicker or thinner anew. Letters of hands 39 and above and drawings 0 to
+99 of each kind are not among them (`benchmarks/learned_prior.py` asks for these).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from evnlos.scene.glyph_sets import DrawingGlyphs
 _SIDE, _POPULATIONS, _DRAWINGS = 64, 3, 300  # pixels; seeds of the hands; drawings of each kind
 _LETTERS, _AS_DRAWN, _GREY = 0.6, 0.5, 0.15  # shares: of letters, of targets at full size, of dimmer ones
 _TURN, _PLACE, _SLANT = 0.06, 0.08, 0.03  # standard deviations: radians, half sides, of the affine matrix
+_BEND, _KNOTS, _PEN = 0.035, 5, 0.4  # of the bends, half sides; their knots along a side; share of other pens
 _RATE, _WARM, _KEPT = 2e-3, 200, 0.999
 
 
@@ -61,7 +62,13 @@ def batch(masks: Tensor, letters: int, count: int, draw: torch.Generator) -> Ten
     affine[:, :, 2] = torch.randn(count, 2, generator=draw) * _PLACE
     affine[:, :, :2] += torch.randn(count, 2, 2, generator=draw) * _SLANT
     grid = F.affine_grid(affine, [count, 1, _SIDE, _SIDE], align_corners=False)
-    cells = F.avg_pool2d(F.grid_sample(masks[chosen][:, None], grid, align_corners=False), 2)
+    knots = _BEND * torch.randn(count, 2, _KNOTS, _KNOTS, generator=draw)
+    bends = F.interpolate(knots, (_SIDE, _SIDE), mode="bicubic", align_corners=True)
+    bent = F.grid_sample(masks[chosen][:, None], grid + bends.permute(0, 2, 3, 1), align_corners=False)
+    thick, thin = F.max_pool2d(bent, 3, stride=1, padding=1), -F.max_pool2d(-bent, 3, stride=1, padding=1)
+    pen = torch.rand(count, 1, 1, 1, generator=draw)
+    bent = torch.where(pen < _PEN / 2, thick, torch.where(pen < _PEN, thin, bent))
+    cells = F.avg_pool2d(bent, 2)
     is_grey = torch.rand(count, generator=draw) < _GREY
     level = torch.where(is_grey, torch.rand(count, generator=draw) * 0.7 + 0.3, torch.ones(count))
     return cells * level[:, None, None, None]
@@ -105,7 +112,7 @@ def main() -> None:
     """Train the prior and write it to the file that is named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="file of the prior")
-    parser.add_argument("--steps", type=int, default=9000, help="steps of the training")
+    parser.add_argument("--steps", type=int, default=12000, help="steps of the training")
     parser.add_argument("--batch", type=int, default=32, help="targets a step")
     parser.add_argument("--width", type=int, default=32, help="channels of the network")
     options = parser.parse_args()

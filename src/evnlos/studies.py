@@ -63,7 +63,11 @@ class Simulated:
 
 
 def simulations(settings: Simulated) -> dict[str, Simulation]:
-    """Return the three sets: handwriting to train on, a hand held out, and Comic letters and digits."""
+    """Return the three sets: handwriting to train on, a hand held out, and Comic letters and digits.
+
+    Args:
+        settings: The study's settings.
+    """
     base = replace(paper(), setup=replace(paper().setup, sensor=settings.sensor))
     unseen = HandwritingGlyphs(writers=1, first_writer=TRAIN_WRITERS)
     comic = FontGlyphs(characters=UPPER_CASE + DIGITS)
@@ -263,7 +267,11 @@ def _left(residuals: dict[str, dict[str, float]], kind: str) -> tuple[float, flo
 
 
 def mismatch_table(found: list[Finding]) -> str:
-    """Return Markdown: a row for each setup and modality, and the margins that matter below it."""
+    """Return Markdown: a row for each setup and modality, and the margins that matter below it.
+
+    Args:
+        found: What came of each setup.
+    """
     head = ["setup", "sees", "left / noise, %", "mean image", "E2E", "simulation only", "EPNP", "EPNP - E2E"]
     drawn = [f"{arm}{ROBUST}" for arm in ("simulation only", "EPNP")]
     drawn = [arm for arm in drawn if any(name == arm for one in found for name, _ in one.psnr_db)]

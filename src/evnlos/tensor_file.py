@@ -105,7 +105,11 @@ def check_floats(tensors: dict[str, torch.Tensor]) -> None:
 
 
 def file_checksum(path: str | Path) -> str:
-    """Return the first 16 hexadecimal digits of a file's SHA-256."""
+    """Return the first 16 hexadecimal digits of a file's SHA-256.
+
+    Args:
+        path: The file.
+    """
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 

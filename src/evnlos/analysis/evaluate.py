@@ -1,7 +1,4 @@
-"""Evaluating a network on a dataset: metrics, baselines, and a check against memorized training objects.
-
-- A network on a dataset: metrics a character and overall, with the baselines beside them.
-"""
+"""Evaluating a network on a dataset: metrics, baselines, and a check against memorized training objects."""
 
 from __future__ import annotations
 
@@ -382,11 +379,14 @@ def reconstruct(
 def check_sampling(weights: Weights, sampling: Sampling) -> None:
     """Refuse samples that were made in another way than those that a network was trained on.
 
+    Args:
+        weights: The network.
+        sampling: How the samples were made.
+
     Raises:
         DataError: Names the settings that differ.
     """
-    made_for = weights.sampling
-    these = sampling if weights.modality.needs_events else sampling.of_frames()
+    made_for, these = weights.sampling, sampling if weights.modality.needs_events else sampling.of_frames()
     # Only this surface is made through the setup, which may have been moved.
     is_known = not made_for.is_solved or same_setup(made_for.setup, these.setup)
     these = these.corrected_as(made_for)  # the maps are alike whether errors are taken from them

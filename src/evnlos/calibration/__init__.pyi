@@ -27,7 +27,6 @@ from .pixel_fit import PixelFitSettings as PixelFitSettings
 from .pixel_fit import fit_candidate as fit_candidate
 from .pixel_fit import panels_of as panels_of
 from .pixel_fit import pixel_at as pixel_at
-from .pixel_fit import position_of as position_of
 from .pixel_fit import value_of as value_of
 from .pixel_light import KnownLight as KnownLight
 from .pixel_light import LitEvents as LitEvents

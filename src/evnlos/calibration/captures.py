@@ -384,15 +384,14 @@ def wall_data(
     )
 
 
-def grouped(places: Array, capture: NDArray[np.int64], tolerance_m: float = 1e-3) -> NDArray[np.int64]:
-    """Return the group of each frame: frames whose targets are at one place, where most captures share places.
+def grouped(places: Array, capture: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the group of each frame: those with targets within a millimetre, if most captures share places.
 
     Args:
         places: Places of the targets [N, 2], metres.
         capture: Capture of each frame [N].
-        tolerance_m: Places nearer than that are one, metres.
     """
-    keys = np.round(places / tolerance_m).astype(np.int64)
+    keys = np.round(places / 1e-3).astype(np.int64)
     _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     captures = len(np.unique(capture))
     if captures < 4 or count.min() < max(3, captures / 2):

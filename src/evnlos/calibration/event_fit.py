@@ -78,7 +78,7 @@ class PixelFit:
 def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int = 0) -> PixelFit:
     """Fit thresholds, mismatch, leak and shot noise by the method of simulated moments, and scan the cutoff.
 
-    Six figures of the recordings (`MOMENTS`) must agree with those of simulated events under the fitted light.
+    Six figures of the recordings (`moments`) must agree with those of simulated events under the fitted light.
     The same random draws are used for every trial, so the figures change smoothly with the settings. The cutoff
     shows only in when events come, so it is chosen by a map of counts in tenths of a second. A leak below its
     standard error is taken for none. The first state is the one of the two whose events are nearer to those

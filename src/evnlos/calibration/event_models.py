@@ -149,7 +149,6 @@ def fit_model(
     near: PixelSettings,
     *,
     seed: int = 0,
-    iterations: int = 12,
 ) -> ModelFit:
     """Fit one of `MODELS` by the method of simulated moments: the logarithms of `figures_of` must agree.
 
@@ -158,7 +157,6 @@ def fit_model(
         name: Name of the model.
         near: A pixel of another model that was fitted: the search starts at its thresholds, leak and noise.
         seed: Seed of the simulations; all trials draw the same noise.
-        iterations: Most steps.
     """
     chosen, free = MODELS[name]
     start: Any = chosen
@@ -186,9 +184,7 @@ def fit_model(
     # A bold step may end where a pixel sends a hundred times the events: half a minute that tells nothing.
     most = [_FURTHEST if f.log else 0.5 * (f.high - f.low) for f in free]
     steps = [f.step for f in free]
-    found = levenberg_marquardt(
-        residual, first, steps, bounds, iterations=iterations, tolerance=5e-3, most=most
-    )
+    found = levenberg_marquardt(residual, first, steps, bounds, iterations=12, tolerance=5e-3, most=most)
     pixel = made(found.values)
     scale = [getattr(pixel, f.name) if f.log else 1.0 for f in free]
     error = {f.name: float(e * s) for f, e, s in zip(free, found.error, scale, strict=True)}

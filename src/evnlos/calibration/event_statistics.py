@@ -43,9 +43,6 @@ _MOST_CAPTURES = 16  # that tell of errors: a second or two each
 _SETTLE = 0.05  # share of the recording in which the pixels' references forget their start
 _QUIET, _ACTIVE = 0.06, 0.5  # range of the log light of a pixel that sees nothing, and of one that sees much
 
-MOMENTS = ("ON, active", "OFF, active", "scatter ON", "scatter OFF", "ON, quiet", "OFF, quiet")
-"""Figures of `moments`, a pixel and second: events, and the variance of the counts' roots among neighbours."""
-
 
 @dataclass(frozen=True)
 class Recording:
@@ -164,7 +161,10 @@ def regions_of(recording: Recording) -> Regions:
 
 
 def moments(recordings: Sequence[Recording], regions: Sequence[Regions], events: Sequence[Events]) -> NDArray:
-    """Return the six figures of `MOMENTS`, float64 [6]."""
+    """Return six figures of a pixel and second, float64 [6], ON before OFF in each pair.
+
+    Events of active pixels, the variance of the roots of their counts among neighbours, events of quiet pixels.
+    """
     total, pixels = np.zeros(6), np.zeros(2)
     for recording, region, found in zip(recordings, regions, events, strict=True):
         counts = [count_map(found, polarity, recording.settled_us) for polarity in (True, False)]

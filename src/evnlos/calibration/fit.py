@@ -31,7 +31,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import written_alike
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import HandwritingGlyphs, Ink, LineMotion, Strokes, Target
-from evnlos.setups import RadiometricSetup, SensorSize, Setup
+from evnlos.setups import SensorSize, Setup
 
 _AT_NOISE = 1.03  # times the noise's residual: what is below has nothing left to explain
 _EXAMPLES = 3
@@ -202,16 +202,16 @@ def fit_setup(
         raise DataError(f"{alone[0]} holds frames alone, no events; fit the frames alone (--no-events)")
     start, fixed = _at_known_distance(settings, fit)
     residuals: dict[str, Residual] = {}
-    wall = start if isinstance(start, RadiometricSetup) and _is_any(settings, fit) else None
-    if settings.measured and wall is None:
+    is_any = start.wall_start() is not None and _is_any(settings, fit)
+    if settings.measured and not is_any:
         raise ConfigError(
             f"measured.{next(iter(settings.measured))} is a prior of the fit of any wall, and this one is by a "
             "formula; leave it out, or give --wall any"
         )
     begin(1)
-    if wall is not None:
+    if is_any:
         free, measured = settings.fit_distance, settings.measured
-        optics = fit_wall(fit, held, wall, fit_distance=free, measured=measured).optics
+        optics = fit_wall(fit, held, start, fit_distance=free, measured=measured).optics
     elif settings.targets == "known":
         optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     else:
@@ -233,7 +233,7 @@ def fit_setup(
     residuals[_WITHOUT_PATTERN] = replace(
         residuals["frames held out"], before=residuals["frames held out"].after, after=corrected
     )
-    if wall is None:
+    if not is_any:
         optics = optics.raised(residuals[_WITHOUT_PATTERN])
     start_pixel: PixelSettings = settings.start.pixel
     if settings.events:
@@ -275,7 +275,7 @@ def fit_setup(
         settings.targets,
         float(seen.relative((seen.frames - models["fit"].frames.mean(dim=0)) * seen.weight)),
         known,
-        1.0 if wall is None else frame_doubt(held, optics.setup, noise),
+        frame_doubt(held, optics.setup, noise) if is_any else 1.0,
         Ink.of(shown),
         Shown.by(simulation),
     )

@@ -232,17 +232,6 @@ def value_of(free: Free, u: NDArray | float) -> Array:
     return np.exp(low + share * (high - low)) if free.log else low + share * (high - low)
 
 
-def position_of(free: Free, value: float) -> float:
-    """Return the normal position of a free number; inverse of `value_of`.
-
-    Args:
-        free: The number's range and scale.
-        value: Its value, within the range.
-    """
-    low, high, at = (math.log(n) if free.log else n for n in (free.low, free.high, value))
-    return NormalDist().inv_cdf(min(max((at - low) / (high - low), 1e-4), 1 - 1e-4))
-
-
 def pixel_at(start: PixelSettings, free: Sequence[Free], u: Array) -> PixelSettings:
     """Return a pixel whose free numbers stand at normal positions u [P].
 

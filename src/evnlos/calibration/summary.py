@@ -18,7 +18,6 @@ from evnlos.calibration.event_fit import EVENT_RESIDUALS, Row, event_warnings, p
 from evnlos.calibration.event_statistics import write_event_errors
 from evnlos.calibration.fit import SetupFit, fit_setup
 from evnlos.calibration.transport_fit import Residual, values_of
-from evnlos.calibration.wall_search import WALL_FILE
 from evnlos.config import save_yaml
 from evnlos.data import captures_in, randomized
 from evnlos.data.fixed_pattern import PATTERN_FILE, save_pattern
@@ -28,7 +27,7 @@ from evnlos.files import write_atomically
 from evnlos.machine import Progress, silent
 from evnlos.registry import __version__
 from evnlos.scene import HandwritingGlyphs
-from evnlos.setups import CALIBRATED_FILE, TRAINING_FILE, FittedSetup
+from evnlos.setups import CALIBRATED_FILE, TRAINING_FILE
 from evnlos.types import aligned
 
 CALIBRATION_VALUES_FILE = "calibration.json"
@@ -364,16 +363,10 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
 
 def _with_findings(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
     """Return the simulation with the fit's warnings, and a fitted wall's file in the setup's folder."""
-    simulation = simulation.with_setup(misfit="; ".join(warnings_of(fit)))
-    setup = simulation.setup
-    if not isinstance(setup, FittedSetup):
-        return simulation
-    path = (out / WALL_FILE).resolve()
-    if Path(setup.file).resolve() != path:
-        write_atomically(path, Path(setup.file).read_bytes())
     left = round(fit.residuals["frames held out, without pattern"].unexplained, 4)
-    told = {"unexplained": left, "frame_doubt": fit.frame_doubt}
-    return simulation.with_setup(file=str(path), ink=fit.ink, **told)
+    setup = replace(simulation.setup, misfit="; ".join(warnings_of(fit)))
+    setup = setup.kept_in(out, unexplained=left, frame_doubt=fit.frame_doubt, ink=fit.ink)
+    return replace(simulation, setup=setup)
 
 
 def _with_targets(fit: SetupFit, simulation: Simulation, folder: Path) -> Simulation:

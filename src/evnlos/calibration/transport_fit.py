@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import CaptureSet
+from evnlos.calibration.captures import Array, CaptureSet
 from evnlos.calibration.frame_model import FrameModel, fitting_strip, working_shape
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import note
@@ -42,7 +42,7 @@ class Residual:
         return math.sqrt(max(self.after**2 - self.noise**2, 0.0))
 
 
-Residuals = Callable[[NDArray[np.float64]], torch.Tensor]
+Residuals = Callable[[Array], torch.Tensor]
 """From the parameters [P] to the residual, any shape."""
 
 
@@ -58,8 +58,8 @@ class Minimum:
         evaluations: How often the residual was computed.
     """
 
-    values: NDArray[np.float64]
-    error: NDArray[np.float64]
+    values: Array
+    error: Array
     rms: float
     evaluations: int
 
@@ -130,12 +130,7 @@ def levenberg_marquardt(
 
 
 def forward_jacobian(
-    residual: Residuals,
-    values: NDArray[np.float64],
-    now: torch.Tensor,
-    step: NDArray[np.float64],
-    high: NDArray[np.float64],
-    what: str = "",
+    residual: Residuals, values: Array, now: torch.Tensor, step: Array, high: Array, what: str = ""
 ) -> torch.Tensor:
     """Return the derivatives of a residual by forward differences.
 
@@ -160,7 +155,7 @@ def forward_jacobian(
     return torch.stack(columns, dim=1)
 
 
-def _standard_error(jacobian: torch.Tensor, now: torch.Tensor) -> NDArray[np.float64]:
+def _standard_error(jacobian: torch.Tensor, now: torch.Tensor) -> Array:
     """Return the square root of the diagonal of s^2 (J^T J)^-1; infinite for a direction without curvature."""
     normal = (jacobian.T @ jacobian).double().numpy()
     scale = np.sqrt(np.diag(normal))
@@ -174,30 +169,41 @@ def _standard_error(jacobian: torch.Tensor, now: torch.Tensor) -> NDArray[np.flo
     return np.sqrt(variance * spread) / scale
 
 
-def clustered_error(
-    jacobian: torch.Tensor, left: torch.Tensor, captures: NDArray[np.int64], blocks: int = 5
-) -> NDArray[np.float64]:
-    """Return standard errors [P] that hold a model's misfit, none below that of independent samples.
+BLOCKS = 5  # of the image along either axis
+
+
+def scatter_of(scores: Array, captures: NDArray[np.int64], block: NDArray[np.int64], few: float = 1.0) -> Array:
+    """Return how the gradients of whole captures and of whole blocks of the image scatter about zero, [P, P].
 
     What a model gets wrong is alike over a capture and a part of the image, so its pixels are no independent
     samples (the sandwich estimator with two kinds of clusters; Cameron, Gelbach, Miller 2011).
 
     Args:
+        scores: What each frame and pixel adds to the gradient [N, M, P].
+        captures: Number of the capture of each frame [N].
+        block: Number of the block of each pixel [M].
+        few: Factor on the captures' part, for their small number.
+    """
+    scatter = np.zeros((scores.shape[-1], scores.shape[-1]))
+    for weight, number, values in ((few, captures, scores.sum(axis=1)), (1.0, block, scores.sum(axis=0))):
+        each = np.stack([values[number == k].sum(axis=0) for k in np.unique(number)])
+        scatter += weight * (each.T @ each)
+    return scatter
+
+
+def clustered_error(jacobian: torch.Tensor, left: torch.Tensor, captures: NDArray[np.int64]) -> Array:
+    """Return standard errors [P] that hold a model's misfit, none below that of independent samples.
+
+    Args:
         jacobian: Derivatives of the residual [N h w, P].
         left: The residual at the minimum [N, h, w].
         captures: Number of the capture of each frame [N].
-        blocks: Blocks of the image along either axis.
     """
     count, (height, width) = len(np.unique(captures)), left.shape[1:]
-    row, column = (torch.arange(n) * blocks // n for n in (height, width))
-    block = (row[:, None] * blocks + column).flatten()
-    scores = (jacobian * left.flatten()[:, None]).double().unflatten(0, (len(left), height * width))
-    parts = []
-    for index, values in ((torch.from_numpy(captures), scores.sum(dim=1)), (block, scores.sum(dim=0))):
-        each = values.new_zeros(int(index.max()) + 1, values.shape[1]).index_add(0, index, values)
-        parts.append(each.T @ each)
-    few = count / max(count - 1, 1)
-    scatter = (parts[0] * few + parts[1]).numpy()
+    row, column = (np.arange(n) * BLOCKS // n for n in (height, width))
+    scores = (jacobian * left.flatten()[:, None]).double().unflatten(0, (len(left), height * width)).numpy()
+    block = (row[:, None] * BLOCKS + column).ravel()
+    scatter = scatter_of(scores, captures, block, count / max(count - 1, 1))
     alone = _standard_error(jacobian, left.flatten())
     inverse = np.linalg.pinv((jacobian.T @ jacobian).double().numpy(), hermitian=True)
     return np.maximum(alone, np.sqrt(np.diag(inverse @ scatter @ inverse)))
@@ -222,24 +228,19 @@ class TransportFit:
     before: Setup
     setup: Setup
     parameters: tuple[Parameter, ...]
-    error: NDArray[np.float64]
+    error: Array
 
     def raised(self, left: Residual) -> TransportFit:
         """Return the fit with errors times a residual over its noise; infinite where one is on a bound."""
-        return replace(
-            self, error=self.error * (math.inf if self.on_bound else max(1, left.after / left.noise))
-        )
+        factor = math.inf if self.on_bound else max(1, left.after / left.noise)
+        return replace(self, error=self.error * factor)
 
     @property
     def on_bound(self) -> dict[str, float]:
         """Parameters that ended on a bound of the search, within half a step, and that bound in its unit."""
-        found: dict[str, float] = {}
-        for p in self.parameters:
-            value = encoded(p, values_of(self.setup)[p.name])
-            for bound in (p.low, p.high):
-                if abs(value - encoded(p, bound)) <= 0.5 * p.step:
-                    found[p.name] = bound
-        return found
+        at = values_of(self.setup)
+        ends = ((p, bound) for p in self.parameters for bound in (p.low, p.high))
+        return {p.name: end for p, end in ends if abs(encoded(p, at[p.name]) - encoded(p, end)) <= 0.5 * p.step}
 
 
 def parameters_of(setup: Setup, fixed: tuple[str, ...] = ()) -> tuple[Parameter, ...]:
@@ -296,9 +297,7 @@ def fit_transport(
         DataError: The frames do not follow the targets.
     """
     start = fitting_strip(start, capture_set)
-    start = start.with_parameters(
-        values_of(start)
-    )  # what follows from others is written out: it moves by itself
+    start = start.with_parameters(values_of(start))  # what follows from others moves by itself
     parameters = parameters_of(start, fixed)
     coarse = FrameModel(capture_set, working_shape(capture_set.shape, columns // 2), _every(capture_set, 400))
     fine = FrameModel(capture_set, working_shape(capture_set.shape, columns), _every(capture_set, 200))
@@ -319,27 +318,22 @@ def _search(
     parameters: tuple[Parameter, ...],
     iterations: int,
     captures: NDArray[np.int64] | None = None,
-) -> tuple[Setup, NDArray[np.float64]]:
-    def residual(values: NDArray[np.float64]) -> torch.Tensor:
+) -> tuple[Setup, Array]:
+    def residual(values: Array) -> torch.Tensor:
         try:
             light = model.light(moved(start, parameters, values))
         except ConfigError:  # a camera that can't be, e.g. one that sees past the wall: the search turns back
             return model.frames * model.weight
         return model.fit(light)[1]
 
-    here = values_of(start)
-    found = levenberg_marquardt(
-        residual,
-        [encoded(p, here[p.name]) for p in parameters],
-        [p.step for p in parameters],
-        [(encoded(p, p.low), encoded(p, p.high)) for p in parameters],
-        iterations=iterations,
-    )
+    here, steps = values_of(start), [p.step for p in parameters]
+    first = [encoded(p, here[p.name]) for p in parameters]
+    bounds = [(encoded(p, p.low), encoded(p, p.high)) for p in parameters]
+    found = levenberg_marquardt(residual, first, steps, bounds, iterations=iterations)
     result, error = moved(start, parameters, found.values), found.error
     if captures is not None:
-        left, steps = residual(found.values), np.array([p.step for p in parameters])
-        high = np.array([encoded(p, p.high) for p in parameters])
-        slopes = forward_jacobian(residual, found.values, left.flatten(), steps, high, "errors, ")
+        left, high = residual(found.values), np.array(bounds)[:, 1]
+        slopes = forward_jacobian(residual, found.values, left.flatten(), np.array(steps), high, "errors, ")
         error = clustered_error(slopes, left, captures)
     scale = [values_of(result)[p.name] if p.log else 1.0 for p in parameters]
     return result, error * np.array(scale)
@@ -388,7 +382,7 @@ def rescaled(setup: Setup, **factors: float) -> Setup:
     )
 
 
-def moved(setup: Setup, parameters: tuple[Parameter, ...], values: NDArray[np.float64]) -> Setup:
+def moved(setup: Setup, parameters: tuple[Parameter, ...], values: Array) -> Setup:
     """Return the setup with the search's values, [len(parameters)], each as `encoded` gives it."""
     return setup.with_parameters(
         {p.name: math.exp(v) if p.log else float(v) for p, v in zip(parameters, values, strict=True)}

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Array, WallData
+from evnlos.calibration.transport_fit import BLOCKS, scatter_of
 from evnlos.errors import ConfigError
 from evnlos.machine import note
 from evnlos.optics.facets import (
@@ -46,6 +47,7 @@ _TILT = 0.15  # of the coefficients of the sensitivity's polynomial
 _MATTE = 10.0  # of the matte part, in units that count beside the facets
 _CHUNK = 400  # pixels whose derivatives are held at a time
 _TRIALS = 6
+_TOLERANCE = 1e-3  # a search ends when a step lowers its cost by a smaller fraction
 
 
 @dataclass(frozen=True)
@@ -263,7 +265,6 @@ def refine(
     prior: Pose,
     freedoms: Sequence[Freedom] = FREEDOMS,
     iterations: int = 10,
-    tolerance: float = 1e-3,
 ) -> Progress:
     """Fit pose, slopes and sensitivity together: Gauss-Newton with damping, smooth slopes, and what is known.
 
@@ -273,7 +274,6 @@ def refine(
         prior: What is known of the pose: the means of the freedoms' priors.
         freedoms: Numbers of the pose that move.
         iterations: Most steps.
-        tolerance: The search ends when a step lowers the cost by less than this fraction.
     """
     unknowns = _Unknowns(freedoms, state, prior)
     power = float((data.shared_removed(data.seen) ** 2 * data.weight[:, None]).sum())
@@ -301,7 +301,7 @@ def refine(
             if reached < cost:
                 state, now, damping = trial, after, max(damping / 40, 1e-6)
                 break
-        if cost - reached < tolerance * cost:
+        if cost - reached < _TOLERANCE * cost:
             break
     away = unknowns.away(state)
     return Progress(
@@ -310,32 +310,25 @@ def refine(
 
 
 def uncertainty(
-    data: WallData, state: WallState, *, prior: Pose, freedoms: Sequence[Freedom] = FREEDOMS, blocks: int = 5
+    data: WallData, state: WallState, *, prior: Pose, freedoms: Sequence[Freedom] = FREEDOMS
 ) -> Array:
-    """Return standard errors of the pose's freedoms, in the search's coordinates, misfit included.
-
-    The gradients of whole captures and of whole blocks of the image scatter about zero as much as the errors of
-    model and noise let them (the sandwich estimator with two kinds of clusters; Cameron, Gelbach, Miller 2011).
+    """Return standard errors of the pose's freedoms, in the search's coordinates; see `scatter_of`.
 
     Args:
         data: Frames and targets.
         state: The fit.
         prior: See `refine`.
         freedoms: Numbers of the pose that were fitted.
-        blocks: Blocks of the image along either axis.
     """
     unknowns = _Unknowns(freedoms, state, prior)
     now, scores = state.residual(data), []
     gram, _ = normal_equations(data, state, unknowns, now, scores)
     temper = EFFECTIVE / float((now**2).sum())
     inverse = np.linalg.inv(gram * temper + unknowns.information)
-    each = np.concatenate(scores)  # [P, C, M]
-    ends = [(v - v.min()) / (np.ptp(v) + 1e-9) * blocks for v in (data.rows, data.columns)]
-    row, column = (np.minimum(v, blocks - 1).astype(int) for v in ends)
-    block = row * blocks + column
-    by_block = np.stack([each[block == b].sum(axis=(0, 1)) for b in np.unique(block)])
-    by_capture = each.sum(axis=0)
-    scatter = temper**2 * (by_block.T @ by_block + by_capture.T @ by_capture) + unknowns.information
+    each = np.concatenate(scores).swapaxes(0, 1)  # [C, P, M]
+    ends = [(v - v.min()) / (np.ptp(v) + 1e-9) * BLOCKS for v in (data.rows, data.columns)]
+    row, column = (np.minimum(v, BLOCKS - 1).astype(int) for v in ends)
+    scatter = temper**2 * scatter_of(each, np.arange(len(each)), row * BLOCKS + column) + unknowns.information
     return np.sqrt(np.diag(inverse @ scatter @ inverse)[: unknowns.poses])
 
 

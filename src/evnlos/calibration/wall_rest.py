@@ -204,7 +204,7 @@ def _means(data: WallData, values: Array) -> Array:
     return np.stack([values[:, data.group == g].mean(axis=1) for g in range(data.group.max() + 1)], axis=1)
 
 
-def pixel_sensitivity(data: WallData, light: Array, spread: float = _TEXTURE) -> tuple[Array, Array]:
+def pixel_sensitivity(data: WallData, light: Array) -> tuple[Array, Array]:
     """Return each pixel's sensitivity beside the model's [P], and its precision over that of the prior [P].
 
     Least squares of what differs between captures.
@@ -212,13 +212,12 @@ def pixel_sensitivity(data: WallData, light: Array, spread: float = _TEXTURE) ->
     Args:
         data: Frames.
         light: The model's light [P, N].
-        spread: Standard deviation of the sensitivities about 1.
     """
     model, seen = data.shared_removed(light), data.shared_removed(data.seen)
     power = (model * model).sum(axis=1)
     noise = float(np.mean((seen - model) ** 2))
     ratio = (model * seen).sum(axis=1) / np.maximum(power, 1e-12 * power.max())
-    return ratio, power * (spread**2 / noise)
+    return ratio, power * (_TEXTURE**2 / noise)
 
 
 def _smoothed(data: WallData, ratio: Array, precision: Array, smooth: float) -> Array:

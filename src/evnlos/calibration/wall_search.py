@@ -33,8 +33,8 @@ from evnlos.calibration.wall_rest import WallRest, rest_of
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import note
 from evnlos.optics.facets import Pose
-from evnlos.setups import FittedSetup, RadiometricSetup, SensorSize
-from evnlos.setups.files import AboutWall, FittedWall, write_fitted
+from evnlos.setups import FittedSetup, SensorSize, Setup
+from evnlos.setups.files import WALL_FILE, AboutWall, FittedWall, write_fitted
 from evnlos.types import Plane
 
 
@@ -169,7 +169,6 @@ def _mirrored(data: WallData) -> NDArray[np.int64]:
     return np.where(data.pixel[at] == wanted, at, np.arange(len(at)))
 
 
-WALL_FILE = "wall.safetensors"
 _SEARCH_CELL_M = 0.005
 _CELL_M = 0.0025
 _FREE_DISTANCE = 0.3
@@ -193,7 +192,7 @@ class WallFit:
 def fit_wall(
     fit: CaptureSet,
     held: CaptureSet,
-    start: RadiometricSetup,
+    start: Setup,
     *,
     fit_distance: bool = False,
     measured: Mapping[str, tuple[float, float]] | None = None,
@@ -204,18 +203,15 @@ def fit_wall(
     Args:
         fit: Captures to fit.
         held: Captures that decide which freedoms stay.
-        start: What is known of camera and target; its roughness is the start's.
+        start: Its `wall_start` is what is known of camera and target, and the start's roughness.
         fit_distance: Whether the distance of target and wall is hardly known; else to 3 %.
         measured: Name of a freedom -> its value and standard deviation, as somebody has measured them.
         columns: Columns of the working images of the search, pixels.
     """
-    known = Pose(
-        camera_distance_m=start.camera_distance_m,
-        camera_angle_deg=start.camera_angle_deg,
-        field_of_view_deg=start.field_of_view_deg,
-        distance_m=start.distance_m,
-        target_offset_m=start.offset_m(),
-    )
+    begin = start.wall_start()
+    if begin is None:
+        raise ConfigError(f"a wall of any kind is fitted from a setup of kind radiometric, not {start.kind!r}")
+    known, *roughness = begin
     freedoms = tuple(
         replace(f, spread=_FREE_DISTANCE) if f.name == "distance_m" and fit_distance else f for f in FREEDOMS
     )
@@ -228,8 +224,7 @@ def fit_wall(
     strip = travelled(fit, held, _CELL_M).extent_m
     found = _setup(rest.wall, search.state.pose, rest.ambient, folder / WALL_FILE, strip, fit.shape)
     coarse = wall_data(fit, 25, plane, every=8)
-    roughness = start.roughness
-    first, _ = start_at(coarse, known, np.array([[roughness, start.roughness_y or roughness]]))
+    first, _ = start_at(coarse, known, np.array([roughness]))
     before = _setup(
         _plain(first, plane, fit.shape), known, rest.ambient, folder / "start.safetensors", strip, fit.shape
     )

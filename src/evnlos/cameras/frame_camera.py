@@ -50,6 +50,10 @@ class SensorSize:
         aspect = self.pixel_aspect * (self.height * shape[1]) / (self.width * shape[0])
         return SensorSize(*shape, aspect)
 
+    def aspect_at(self, shape: tuple[int, int]) -> float:
+        """Return height over width of the pixels of an image of a size (H, W) of what the sensor sees."""
+        return self.resized(shape).pixel_aspect
+
 
 @dataclass(frozen=True)
 class FrameCamera:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -165,10 +166,15 @@ class ExperimentCommand:
         records = [r for r in records if r.setup == self.captures_of and r.split == study.split]
         text = _tables(name, records, self.metric)
         text += experiment.bounds_table(self.out / "setups" / studies[0].setup, folders[0], self.captures_of)
-        path = self.out / f"{name}-{self.captures_of}-{study.split}.md"
-        write_atomically(path, text.encode())
+        name = f"{name}-{self.captures_of}-{study.split}"
+        self._tell(name, text, lambda image: draw_scores(records, self.metric, image))
+
+    def _tell(self, name: str, text: str, draw: Callable[[Path], object] | None = None) -> None:
+        """Write a table and print it; draw the image that goes with it."""
+        write_atomically(self.out / f"{name}.md", text.encode())
         print(text)
-        drawn(image := path.with_suffix(".png"), lambda: draw_scores(records, self.metric, image))
+        if draw is not None:
+            drawn(image := self.out / f"{name}.png", lambda: draw(image))
 
     def _study(self) -> Study:
         """Return the named study with what the command line changes."""
@@ -214,11 +220,9 @@ class ExperimentCommand:
         settings = replace(settings, writers=self.writers or settings.writers, **changed)
         with ProgressBars() as progress:
             run_simulated(settings, progress)
-        text, everything = "", experiment.read_records(self.out / "records" / SIMULATION)
-        for tested in ("nist", "comic"):
-            text += _tables("simulation", [r for r in everything if r.setup == tested], self.metric) + "\n"
-        write_atomically(self.out / "simulation.md", text.encode())
-        print(text)
+        everything = experiment.read_records(self.out / "records" / SIMULATION)
+        each = ([r for r in everything if r.setup == tested] for tested in ("nist", "comic"))
+        self._tell("simulation", "".join(_tables("simulation", those, self.metric) + "\n" for those in each))
 
     def _conditions(self) -> None:
         from evnlos.plot.figures import draw_regimes
@@ -227,8 +231,7 @@ class ExperimentCommand:
         with ProgressBars() as progress:
             found = experiment.sweep_parameters(experiment.conditions(), out, self.workers, progress=progress)
             mapped = experiment.sweep_parameters(experiment.regimes(), out, self.workers, "", progress)
-        print(text := experiment.conditions_table(found) + "\n")
-        write_atomically(self.out / "conditions.md", text.encode())
+        self._tell("conditions", experiment.conditions_table(found) + "\n")
         drawn(shown, lambda: draw_regimes(mapped, shown))
 
     def _generalization(self) -> None:
@@ -244,11 +247,9 @@ class ExperimentCommand:
             )
         name = f"generalization-{self.captures_of}-{weights.stem}"
         experiment.write_generalization(found, self.out / f"{name}.json")
+        checks = {one.name: one.confidence_checks for one in found}
         text = experiment.generalization_table(found) + "\n"
-        write_atomically(self.out / f"{name}.md", text.encode())
-        print(text)
-        shown, checks = self.out / f"{name}.png", {one.name: one.confidence_checks for one in found}
-        drawn(shown, lambda: draw_confidence(checks, shown))
+        self._tell(name, text, lambda image: draw_confidence(checks, image))
 
     def _mismatch(self) -> None:
         from evnlos.studies import mismatch_table, run_mismatch
@@ -263,8 +264,7 @@ class ExperimentCommand:
             fitted = self.out / f"{setup}-seed{self.seeds[0]}" / "setups" / "demo"
             first = min((captures / setup).glob("*/capture.yaml")).parent
             text += experiment.bounds_table(fitted, first, setup)
-        write_atomically(self.out / "mismatch.md", text.encode())
-        print(text)
+        self._tell("mismatch", text)
 
 
 def _tables(name: str, records: list, metric: str) -> str:

@@ -20,6 +20,9 @@ from evnlos.events import frame_blocks
 from evnlos.types import Events
 
 _DARK = 0.02  # of the peak: added to frames before the logarithm, or black noise would count most
+_OFFSET_STEP_US = 5_000  # between offsets that are looked at
+_LIKENESS, _DISTINCT = 0.6, 1.5  # least correlation of an answer, and its ratio to the next best
+_WIDEST = 2.0  # of the lobe around it, in times between frames
 _EDGES_NEEDED = 4  # intervals between frames that lie inside the recording of events
 
 
@@ -47,11 +50,7 @@ def find_offset(
     times_us: NDArray[np.int64],
     *,
     search_us: int = 1_000_000,
-    step_us: int = 5_000,
     blocks: int = 8,
-    min_correlation: float = 0.6,
-    min_ratio: float = 1.5,
-    max_lobe_frames: float = 2.0,
 ) -> ClockOffset:
     """Return the offset at which the events between two frames explain the frames' difference best.
 
@@ -72,11 +71,7 @@ def find_offset(
         frames: Frames on the same pixels as the events (or one block is used), [N, H, W], N at least 5.
         times_us: Their times on their own clock, [N], microseconds, ascending.
         search_us: Largest offset looked at, either sign, microseconds.
-        step_us: Distance between offsets looked at, microseconds.
         blocks: Blocks along the longer side, 1 to 64; 1 for cameras that are not registered to each other.
-        min_correlation: Correlation below which the answer is refused.
-        min_ratio: Ratio of the best lobe to the next below which the answer is refused.
-        max_lobe_frames: Width of the lobe, in times between frames, above which the answer is refused.
 
     Raises:
         DataError: Too few frames, or no offset stands out: the correlation, its ratio and the cures are named.
@@ -101,8 +96,8 @@ def find_offset(
     same = frames.shape[1:] == events.shape
     grid = grid_of(events.shape, blocks) if same else (1, 1)
     changes = _changes(frames, grid, signed)  # [N - 1, B]
-    clock_us, sums = running_sums(events, grid, step_us, signed)  # [T], [T, B]
-    offsets = np.arange(-search_us, search_us + 1, step_us, dtype=np.int64)
+    clock_us, sums = running_sums(events, grid, _OFFSET_STEP_US, signed)  # [T], [T, B]
+    offsets = np.arange(-search_us, search_us + 1, _OFFSET_STEP_US, dtype=np.int64)
     scores = np.array([agreement(changes, times_us + offset, clock_us, sums) for offset in offsets])
     if np.isnan(scores).all():
         raise DataError(
@@ -110,11 +105,11 @@ def find_offset(
             f"{events.t_us[0]}..{events.t_us[-1]} us; state offset_us, or search further"
         )
     found = _peak(offsets, np.nan_to_num(scores, nan=0.0))
-    widest = round(max_lobe_frames * float(np.median(np.diff(times_us))))
-    if found.correlation < min_correlation or found.ratio < min_ratio or found.lobe_us > widest:
+    widest = round(_WIDEST * float(np.median(np.diff(times_us))))
+    if found.correlation < _LIKENESS or found.ratio < _DISTINCT or found.lobe_us > widest:
         raise DataError(
-            f"the clock offset is uncertain: correlation {found.correlation:.2f} (at least {min_correlation:g} "
-            f"is needed), {found.ratio:.2f} times the next best (at least {min_ratio:g}), in a lobe "
+            f"the clock offset is uncertain: correlation {found.correlation:.2f} (at least {_LIKENESS:g} is "
+            f"needed), {found.ratio:.2f} times the next best (at least {_DISTINCT:g}), in a lobe "
             f"{found.lobe_us} us wide (at most {widest}); state offset_us, or record a blink of the light or a "
             "jerk of the target"
         )

@@ -27,7 +27,6 @@ from evnlos.events import (
     frame_blocks,
     iter_time_surfaces,
     read_events,
-    time_surface,
 )
 from evnlos.scene import LineMotion, Motion, Scene, SeveralTargets, Target
 from evnlos.types import Colour, Events, Plane
@@ -127,7 +126,7 @@ class Samples:
 
     Args:
         frame: What the frame camera saw, float32 [N, H, W], 0..1 (1 = the largest digital number).
-        surface: Surface of the events, float32 [N, 2, H, W]: ON, OFF (`surface_of`).
+        surface: Surface of the events, float32 [N, 2, H, W]: ON, OFF.
         truth: The target on the canvas, float32 [N, H, W], 0..1; None where the target is unknown.
         time_s: Instant of each position, float64 [N], seconds.
         position_m: Target's centre (x, y), float64 [N, 2], metres; None where the motion is unknown.
@@ -148,24 +147,6 @@ class Samples:
 def edges_from(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the instants between positions, int64 [N + 1], microseconds: 0, then those of the positions."""
     return np.concatenate([[0], np.round(times_s * 1e6)]).astype(np.int64)
-
-
-def surface_of(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) -> NDArray[np.float32]:
-    """Return the surface that the settings name at the end of each grid, float32 [N, 2, H, W]: ON, OFF.
-
-    Args:
-        events: The events of the whole recording.
-        edges_us: N + 1 ascending instants, microseconds.
-        sampling: Kind of the surface and its settings.
-    """
-    if sampling.is_solved:
-        raise ConfigError(
-            f"the surface {sampling.surface!r} is made of whole recordings; give another --sampling.surface"
-        )
-    tau_us, mode = sampling.tau_s * 1e6, cast(Any, sampling.surface)
-    if mode == "trace":
-        return event_trace(events, edges_us, tau_us)
-    return time_surface(events, edges_us, tau_us, mode=mode, radius=sampling.radius)
 
 
 def make_samples(
@@ -257,6 +238,10 @@ def reduce_by_area(images: NDArray, shape: tuple[int, int]) -> NDArray[np.float3
 
     Each output pixel is the mean of the input over its cell; the mean of the image is kept.
 
+    Args:
+        images: Real images, [..., H, W].
+        shape: Rows and columns of the result, pixels.
+
     Example:
         >>> reduce_by_area(np.arange(6.0).reshape(1, 6), (1, 4)).round(2)
         array([[0.33, 1.67, 3.33, 4.67]], dtype=float32)
@@ -323,6 +308,9 @@ def split_of(names: list[str], test: list[str], validation: list[str]) -> dict[s
 
 def character_of(name: str) -> str:
     """Return what an object shows, from its name: the part behind the last underscore.
+
+    Args:
+        name: Name of an object or capture, e.g. "near_R".
 
     Example:
         >>> character_of("near_R"), character_of("writer03_A")

@@ -150,6 +150,9 @@ class ShardIndex(NamedTuple):
 def read_shard_index(path: str | Path) -> ShardIndex:
     """Read how much a shard holds and where its target was; the maps are left on disk.
 
+    Args:
+        path: The shard.
+
     Raises:
         DataError: The file is missing or is not a shard.
     """
@@ -205,7 +208,6 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-SPLITS = ("train", "validation", "test")
 PAGE = "dataset.yaml"
 """Name of the file that describes a dataset, in its folder."""
 _DIGEST = "digest"
@@ -395,6 +397,4 @@ def _content(dataset: Dataset) -> dict[str, Any]:
 
 
 def _comparable(content: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: value for key, value in content.items() if key not in ("version", "config_hash", "optics", _DIGEST)
-    }
+    return {k: v for k, v in content.items() if k not in ("version", "config_hash", "optics", _DIGEST)}

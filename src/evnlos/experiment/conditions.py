@@ -372,7 +372,11 @@ def _sequence(
 
 
 def conditions_table(findings: Sequence[Finding]) -> str:
-    """Return Markdown: a row a condition; of a cell "bound / measured" the whole sequence counts."""
+    """Return Markdown: a row a condition; of a cell "bound / measured" the whole sequence counts.
+
+    Args:
+        findings: What came of each condition.
+    """
     head = ["condition", "frames", "exposure, gain", "frame, one", "events, one", "frames, all", "events, all"]
     head += ["both, all", "events - frames, 95 % interval", "events per pixel", "events kB", "frames kB"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
@@ -390,8 +394,7 @@ def conditions_table(findings: Sequence[Finding]) -> str:
         else:
             cells.append(f"{gap:+.1f}")
         cells.append(f"{one.events_per_pixel:.1f}")
-        cells += [
-            f"{size / 1e3:.0f} ({packed / 1e3:.0f})" for size, packed in (one.event_bytes, one.frame_bytes)
-        ]
+        sizes = one.event_bytes, one.frame_bytes
+        cells += [f"{size / 1e3:.0f} ({packed / 1e3:.0f})" for size, packed in sizes]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

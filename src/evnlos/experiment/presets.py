@@ -336,7 +336,6 @@ def generalization(
     setup: Path,
     out: Path,
     workers: int = 0,
-    each: int = 12,
     progress: Progress = silent,
     force: bool = False,
 ) -> list[GeneralizationResult]:
@@ -347,7 +346,6 @@ def generalization(
         setup: Folder of the calibrated setup.
         out: Folder for datasets and results.
         workers: Processes that simulate; 0 = one for each core.
-        each: Objects of a set.
         progress: Called with each step of the simulations, and after each set, with what came of it.
         force: Whether to begin although the machine's memory will hardly do.
 
@@ -362,7 +360,7 @@ def generalization(
     operator = FrameOperator(own.setup, sampling) if "frame" in loaded.modality.slices else None
     processes(workers, 1)
     found = list[GeneralizationResult]()
-    for name, config in evaluation_sets(own, sampling, each).items():
+    for name, config in evaluation_sets(own, sampling, 12).items():
         key = config_hash(config)[:8]
         folder = out / "simulations" / f"{setup.name}-{name.replace(' ', '-')}-{key}"
         dataset = simulate(config, folder, workers, progress=progress, force=force)

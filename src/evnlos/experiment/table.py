@@ -297,19 +297,18 @@ def character_table(records: list[Record], arms: tuple[str, ...], metric: str = 
     return "\n".join(lines)
 
 
-def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> str:
-    """Return Markdown: what an arm gains over the strongest of others, dB, with a 95 % interval.
+def gain_table(records: list[Record], arm: str = "EPNP") -> str:
+    """Return Markdown: what an arm gains over the strongest of end-to-end ones, dB, with a 95 % interval.
 
     Args:
         records: Records of a study.
         arm: Name of the arm.
-        other: How the names of the others begin; of several, each modality has its strongest.
     """
     means = means_of([r for r in records if r.seed >= 0])
     modalities = sorted({r.modality for r in records if r.arm == arm}, key=modality_order)
-    lines = [f"| {arm} - strongest {other} | which | dB, 95 % interval |", "|---|---|---|"]
+    lines = [f"| {arm} - strongest E2E | which | dB, 95 % interval |", "|---|---|---|"]
     for modality in modalities:
-        others = [name for name, seen in means if seen == modality and name.startswith(other)]
+        others = [name for name, seen in means if seen == modality and name.startswith("E2E")]
         if others:
             best = max(others, key=lambda name: float(np.mean(means[name, modality])))
             lines.append(f"| {modality} | {best} | {difference(records, arm, best, modality)} |")
@@ -317,7 +316,11 @@ def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> 
 
 
 def checks_table(records: list[Record]) -> str:
-    """Return Markdown: shares of images that are recognized and that are no memory, and the confusion."""
+    """Return Markdown: shares of images that are recognized and that are no memory, and the confusion.
+
+    Args:
+        records: Records of a study.
+    """
     found: dict[tuple[str, str], list[Record]] = defaultdict(list)
     for record in records:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"

@@ -260,9 +260,7 @@ def crossings(levels, step, on, off, fall, lift, noise, first_noise, out):
     return count
 
 
-def predicted_record(
-    light: SequenceLight, levels: Levels, law: CrossingLaw, seed: int = 0, gap_s: float = np.inf
-) -> EventRecord:
+def predicted_record(light: SequenceLight, levels: Levels, law: CrossingLaw, seed: int = 0) -> EventRecord:
     """Return the record of the events that light would make in pixels of the mean thresholds.
 
     Noise events are drawn and labelled: nothing is learnt from them but the new reference.
@@ -272,7 +270,6 @@ def predicted_record(
         levels: Its levels.
         law: The pixel's constants.
         seed: Seed of the noise events, and of the first references of pixels that do not start at rest.
-        gap_s: As in `record_of`.
     """
     draw = np.random.default_rng([seed, 1])
     count, steps = levels.value.shape
@@ -298,5 +295,5 @@ def predicted_record(
         np.concatenate([ends, columns[2], ends]),
         np.concatenate([np.full(count, 0), np.ones(size, np.int64), np.full(count, 2)]),
         law.starts_at_rest,
-        gap_s,
+        np.inf,
     )

@@ -32,6 +32,9 @@ EVENT_PRIORS = (0.3, 2.0)
 """Weights of the prior, over its own, at which the events of a sequence are solved for the target: one image
 each."""
 
+_RANK = (
+    200  # most factors; events see the logarithm: of rough metal 120 cost 0.7 dB, more than 200 bring nothing
+)
 _COARSEST = (50, 80)
 _TAIL = 1e-4
 _EXTRA, _POWERS = 40, 4  # directions and power iterations of the range finder
@@ -145,7 +148,6 @@ def sequence_light(
     position_m: Callable[[Array], Array],
     span_s: tuple[float, float],
     shape: tuple[int, int] | None = None,
-    rank: int = 200,
     fineness: float = 1.0,
 ) -> SequenceLight:
     """Return the light of a moving target on a camera.
@@ -160,8 +162,6 @@ def sequence_light(
         position_m: The target's centre (x, y) at instants [N], seconds: metres, [N, 2].
         span_s: First and last instant, seconds.
         shape: Size (H, W) of the images; None is the sensor's.
-        rank: Most factors. Events see the logarithm of the light, and of a wall of rough metal 120 factors
-            would cost their estimate 0.7 dB, where more than 200 bring nothing.
         fineness: How many times finer than its blur asks for the setup's cells are. Behind rough metal the
             light is right to 3e-3 of its changes with 1, and to 3e-4 with 2, which forty frames of little
             noise need.
@@ -193,7 +193,7 @@ def sequence_light(
     strip = strip_of(places, Plane(side, side, pitch))
     resized = setup.resized(shape)
     matrix = resized.operator(strip, coarse).dense()
-    left, right = (factor.numpy() for factor in main_factors(matrix, rank))
+    left, right = (factor.numpy() for factor in main_factors(matrix, _RANK))
     if coarse != shape:
         down, across = (_spline_matrix(*sizes) for sizes in zip(coarse, shape, strict=True))
         images = np.einsum("yi,xj,ijr->yxr", down, across, left.reshape(*coarse, -1), optimize=True)

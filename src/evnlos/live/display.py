@@ -30,7 +30,7 @@ from evnlos.live.engine import Picture
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
 from evnlos.untrusted import names_this_machine
 
-_GAP_PX = 8
+_HEIGHT_PX, _GAP_PX = 256, 8
 
 
 def panels(picture: Picture) -> dict[str, NDArray[np.uint8]]:
@@ -39,9 +39,9 @@ def panels(picture: Picture) -> dict[str, NDArray[np.uint8]]:
     return shown | {"events": polarity(picture.surface), "reconstruction": grey(picture.image)}
 
 
-def side_by_side(picture: Picture, height_px: int = 256) -> NDArray[np.uint8]:
-    """Return the panels as one colour image [H, W, 3] of even sides, magnified to about a height, pixels."""
-    zoom = max(1, round(height_px / picture.image.shape[0]))
+def side_by_side(picture: Picture) -> NDArray[np.uint8]:
+    """Return the panels as one colour image [H, W, 3] of even sides, magnified to about 256 rows."""
+    zoom = max(1, round(_HEIGHT_PX / picture.image.shape[0]))
     row: list[NDArray[np.uint8]] = []
     for panel in panels(picture).values():
         colour = panel if panel.ndim == 3 else np.repeat(panel[..., None], 3, axis=-1)

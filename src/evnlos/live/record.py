@@ -26,7 +26,7 @@ from evnlos.events.cleaning import flicker_line
 from evnlos.events.filters import hot_by_counts
 from evnlos.files import new_folder
 from evnlos.live.device import DeviceSource
-from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
+from evnlos.live.packet import Chunk, EventSource, SystemClock
 from evnlos.types import Events
 
 _KEPT_MS = 4096  # of the rate: enough for a line at 100 Hz
@@ -160,7 +160,6 @@ def record_capture(
     seconds: float | None = None,
     tell: Callable[[str], None] | None = None,
     tell_every_s: float = 0.5,
-    clock: Clock | None = None,
 ) -> RecordingInfo:
     """Record a source until it ends, time is up, Ctrl-C, or the disk is nearly full; return how it went.
 
@@ -173,7 +172,6 @@ def record_capture(
         seconds: Length, seconds; None = until the source ends.
         tell: Called with the check of the recording, one line.
         tell_every_s: Seconds between two lines.
-        clock: The clock that goes by.
 
     Raises:
         ConfigError: `seconds` is not positive.
@@ -182,7 +180,7 @@ def record_capture(
     """
     if seconds is not None and not 0 < seconds < float("inf"):
         raise ConfigError(f"seconds is {seconds}; give a positive number")
-    clock = clock or SystemClock()
+    clock = SystemClock()
     facts = source.facts if isinstance(source, DeviceSource) else None
     with new_folder(folder) as draft:
         begun_s, begun = clock.now(), datetime.now(UTC)

@@ -106,7 +106,6 @@ class UdpSource:
         host: Address to listen at; 127.0.0.1 takes packets of this machine only.
         port: Port; 0 takes a free one.
         idle_s: End after so many seconds without a packet, counted from the first one; None = never.
-        clock: The clock that arrivals are told by.
 
     Attributes:
         port: The port that is listened at.
@@ -115,10 +114,8 @@ class UdpSource:
         ConfigError: The address can't be listened at.
     """
 
-    def __init__(
-        self, host: str = "127.0.0.1", port: int = 0, *, idle_s: float | None = None, clock: Clock | None = None
-    ) -> None:
-        self._clock, self._idle_s = clock or SystemClock(), idle_s
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, *, idle_s: float | None = None) -> None:
+        self._clock, self._idle_s = SystemClock(), idle_s
         self._listener = Listener("udp", host, port, self._clock)
         unpack(pack(Packet(0, Events.empty(1, 1))))  # compiles the decoder before the first packet comes
         self.port = self._listener.port
@@ -323,11 +320,6 @@ class UdpSender:
     Args:
         host: Address of the receiver.
         port: Its port.
-        packet_events: Most events per packet.
-        start: Number of the first packet; 0 tells the receiver that a new stream begins.
-
-    Raises:
-        ConfigError: `packet_events` is below 1.
 
     Example:
         >>> source = UdpSource()
@@ -337,13 +329,10 @@ class UdpSender:
         [Events(2 events, 4 x 2, 5..9 us, 50 % ON)]
     """
 
-    def __init__(self, host: str, port: int, *, packet_events: int = USUAL_EVENTS, start: int = 0) -> None:
-        if packet_events < 1:
-            raise ConfigError(f"packet_events is {packet_events}; give at least 1 event a packet")
+    def __init__(self, host: str, port: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._to = host, port
-        self._most = packet_events
-        self._number = start
+        self._number = 0  # tells the receiver that a new stream begins
         self._size: tuple[int, int] | None = None
 
     def __enter__(self) -> UdpSender:
@@ -364,8 +353,8 @@ class UdpSender:
         """
         self._size = events.shape
         columns = {"t_us": events.t_us, "x": events.x, "y": events.y, "p": events.p}
-        for start in range(0, len(events), self._most):
-            part = cut(columns, start, min(start + self._most, len(events)))
+        for start in range(0, len(events), USUAL_EVENTS):
+            part = cut(columns, start, min(start + USUAL_EVENTS, len(events)))
             self._put(Packet(self._number, trusted_events(part, events.width, events.height)))
 
     def _put(self, packet: Packet) -> None:

@@ -23,21 +23,18 @@ SIDE = 32
 """Side of a target plane's image, pixels."""
 
 
-def on_target_plane(
-    images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float | None = None
-) -> Tensor:
+def on_target_plane(images: Tensor, canvas: Plane, position_m: ArrayLike) -> Tensor:
     """Return the part of each image that shows the target, resampled to 32 x 32.
 
     Args:
         images: Images of the canvas, float [N, H, W].
         canvas: Their geometry.
         position_m: Centre (x, y) of the target in each image, [N, 2], metres.
-        size_m: Side of the target plane, metres; None: that which the canvas is made for.
 
     Returns:
         float32 [N, 1, 32, 32]; zero outside the canvas.
     """
-    size_m = target_side_m(canvas) if size_m is None else size_m
+    size_m = target_side_m(canvas)
     centre = torch.as_tensor(np.asarray(position_m), dtype=torch.float32)  # [N, 2]
     span = torch.tensor([canvas.width, canvas.height]) * (canvas.pitch_m / 2)
     ticks = (torch.arange(SIDE) + 0.5) / SIDE * size_m - size_m / 2
@@ -313,14 +310,14 @@ def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) 
     return replace(blank, threshold=threshold, edges=edges, low=low, high=high)
 
 
-def _mixed(names: NDArray, count: int = _MIXED) -> list[NDArray[np.int64]]:
+def _mixed(names: NDArray) -> list[NDArray[np.int64]]:
     """Return the rows of sequences in which each position is of another object; always the same."""
     sequences = [np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())]
     draw = np.random.default_rng(derive_seed(0, "mixed passes"))
     length = min(len(one) for one in sequences)
     return [
         np.array([sequences[i][k] for k, i in enumerate(draw.integers(0, len(sequences), length))])
-        for _ in range(count)
+        for _ in range(_MIXED)
     ]
 
 

@@ -429,15 +429,11 @@ class CornerFloor:
         swing = np.cos(2 * np.pi * rate * t_s + phase).sum(axis=1) / math.sqrt(2.5)
         return self.scene.shake_px * float(swing[0]), self.scene.shake_px * float(swing[1])
 
-    def marks(self, reach_m: float = 0.7) -> dict[str, list[float]]:
-        """Return the pixels (column, row) that `evnlos corner` asks for: edge, wall, end and floor.
-
-        Args:
-            reach_m: How far from the edge the floor is used, metres.
-        """
-        tile = 0.3
+    def marks(self) -> dict[str, list[float]]:
+        """Return the pixels (column, row) that `evnlos corner` asks for: edge, wall, end and floor."""
+        reach, tile = 0.7, 0.3  # of the floor that is used, and of what shows how it lies, metres
         last = math.radians(165)
-        places = [(0.0, 0.0), (-reach_m, 0.0), (-reach_m * math.cos(last), -reach_m * math.sin(last))]
+        places = [(0.0, 0.0), (-reach, 0.0), (-reach * math.cos(last), -reach * math.sin(last))]
         places += [(-tile, -2 * tile), (tile, -2 * tile), (tile, 0.0), (-tile, 0.0)]
         found = self.scene.view.pixels(torch.tensor(places)).numpy().round(1)
         names = ("edge", "wall", "end")

@@ -511,12 +511,11 @@ def facet_matrix(
     shape: tuple[int, int],
     source: Plane,
     dtype: type = np.float32,
-    samples: int = 1,
     pixel_aspect: float = 1.0,
 ) -> NDArray:
     """Return the matrix from the brightness of target cells to the light of camera pixels, [H W, h w].
 
-    A[p, c] = mean over points of pixel p of f(i, o) cos_i cos_t / r^2 times the cell's area, see the module.
+    A[p, c] = f(i, o) cos_i cos_t / r^2 in the middle of pixel p, times the cell's area; see the module.
 
     Args:
         pose: Camera, wall and target.
@@ -524,25 +523,19 @@ def facet_matrix(
         shape: Size (H, W) of the camera image, pixels.
         source: Cells, in the coordinates of the target's motion.
         dtype: float32 or float64.
-        samples: Points of a pixel along either axis.
         pixel_aspect: Height of a pixel over its width.
     """
     height, width = shape
     cells = target_cells(pose, source)
     out = np.zeros((height * width, len(cells)), dtype)
-    part = out if samples == 1 else np.empty_like(out)
     rows, columns = np.meshgrid(
         np.arange(height, dtype=np.float64), np.arange(width, dtype=np.float64), indexing="ij"
     )
-    for dv, du in np.ndindex(samples, samples):
-        shift = [(k + 0.5) / samples - 0.5 for k in (du, dv)]
-        seen = seen_points(pose, shape, columns.ravel() + shift[0], rows.ravel() + shift[1], pixel_aspect)
-        with torchs_threads():
-            for here in noted_rows(len(out)):
-                fill_facets(
-                    part[here], seen.points[here], seen.frames[here], seen.eyes[here], cells, source.pitch_m**2,
-                    table.log_density, table.scale, table.step, table.matte, MASKING,
-                )  # fmt: skip
-        if samples > 1:
-            out += part / samples**2
+    seen = seen_points(pose, shape, columns.ravel(), rows.ravel(), pixel_aspect)
+    with torchs_threads():
+        for here in noted_rows(len(out)):
+            fill_facets(
+                out[here], seen.points[here], seen.frames[here], seen.eyes[here], cells, source.pitch_m**2,
+                table.log_density, table.scale, table.step, table.matte, MASKING,
+            )  # fmt: skip
     return out

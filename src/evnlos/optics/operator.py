@@ -159,6 +159,9 @@ class LinearTransport(Transport):
 def compose(*transports: Transport) -> Transport:
     """Return the transport that applies the given ones in order; it is linear if all of them are.
 
+    Args:
+        transports: One or more; each takes images of the size that the one before makes.
+
     Raises:
         ConfigError: Nothing was given, or a transport makes images of another size than the next one takes.
     """
@@ -194,25 +197,10 @@ class Chain(Transport):
         return reduce(lambda image, step: step(image), self.steps, scene)
 
 
-class LinearChain(LinearTransport):
+class LinearChain(Chain, LinearTransport):
     """Linear transports applied one after the other; built by `compose`."""
 
-    def __init__(self, steps: tuple[LinearTransport, ...]) -> None:
-        self.steps = steps
-        self.source = steps[0].source
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Size of the last step's images."""
-        return self.steps[-1].shape
-
-    @property
-    def output(self) -> Plane | None:
-        """Plane of the last step."""
-        return self.steps[-1].output
-
-    def _forward(self, scene: torch.Tensor) -> torch.Tensor:
-        return reduce(lambda image, step: step(image), self.steps, scene)
+    steps: tuple[LinearTransport, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def _adjoint(self, image: torch.Tensor) -> torch.Tensor:
         return reduce(lambda wall, step: step.adjoint(wall), reversed(self.steps), image)
@@ -267,6 +255,7 @@ class DepthTransport:
     U [P, r] are orthonormal camera images, the same at all distances; C(d) [r, cells] is interpolated in ln d
     by Lagrange's cubics. What is further away is smaller in the image, more blurred, dimmer and seen elsewhere.
     `error` is that of A(d), relative and root mean square: the largest of those amid three steps.
+    Steps of the distance are halved, and images added, until it is 1e-3.
 
     Args:
         matrix: Exact matrix [P, cells] at a distance, metres.
@@ -274,7 +263,6 @@ class DepthTransport:
         high_m: Largest distance, metres.
         source: The cells.
         shape: Size (H, W) of the images, pixels.
-        tolerance: Largest `error`: steps of the distance are halved, and images added, until it is met.
 
     Raises:
         ConfigError: Steps 8 times as fine do not suffice.
@@ -287,7 +275,6 @@ class DepthTransport:
         high_m: float,
         source: Plane,
         shape: tuple[int, int],
-        tolerance: float = _DEPTH_ERROR,
     ) -> None:
         self.source, self.shape, self.low_m, self.high_m = source, shape, low_m, high_m
         self.basis = torch.zeros(shape[0] * shape[1], 0)
@@ -300,19 +287,20 @@ class DepthTransport:
             for k in sorted({*range(0, finest + 1, 2 ** (_MOST_HALVINGS - halving))} - made.keys()):
                 there_m = math.exp(low + k * (high - low) / finest)
                 note(f"light path at {there_m:.3f} m")
-                made[k] = self._added(matrix(there_m), tolerance / 4)
+                made[k] = self._added(matrix(there_m), _DEPTH_ERROR / 4)
             rank = self.basis.shape[1]
             self.nodes = torch.stack([pad(one, (0, 0, 0, rank - len(one))) for _, one in sorted(made.items())])
             values, ways = torch.linalg.eigh(torch.einsum("grc,gsc->rs", self.nodes, self.nodes).double())
-            ways = ways[:, values.cumsum(0) > (tolerance / 4) ** 2 * values.sum()].float()  # what carries light
+            carries = values.cumsum(0) > (_DEPTH_ERROR / 4) ** 2 * values.sum()
+            ways = ways[:, carries].float()
             basis, self.basis, self.nodes = self.basis, self.basis @ ways, ways.mT @ self.nodes
             self.error = self._worst(matrix)
-            if self.error <= tolerance:
+            if self.error <= _DEPTH_ERROR:
                 return
             self.basis = basis
         raise ConfigError(
-            f"matrices interpolated over the distance are off by {self.error:.2g} of the light, {tolerance:g} "
-            "is the most; give a rougher wall, or a path with less depth"
+            f"matrices interpolated over the distance are off by {self.error:.2g} of the light, "
+            f"{_DEPTH_ERROR:g} is the most; give a rougher wall, or a path with less depth"
         )
 
     def coefficients(self, distance_m: float) -> torch.Tensor:

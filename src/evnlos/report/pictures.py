@@ -113,11 +113,11 @@ def polarity(surface: ArrayLike) -> NDArray[np.uint8]:
     return np.clip(picture, 0, 255).astype(np.uint8)
 
 
-def strip(pictures: Sequence[NDArray[np.uint8]], columns: int = 8, gap: int = 2) -> NDArray[np.uint8]:
+def strip(pictures: Sequence[NDArray[np.uint8]], columns: int = 8) -> NDArray[np.uint8]:
     """Return images [H, W] or [H, W, 3] of one size side by side, `columns` a row, as one image."""
     rgb = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=-1) for p in pictures]
     height, width = rgb[0].shape[:2]
-    columns = min(columns, len(rgb))
+    columns, gap = min(columns, len(rgb)), 2
     rows = -(-len(rgb) // columns)
     sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), 128, np.uint8)
     for i, picture in enumerate(rgb):

@@ -26,7 +26,7 @@ from evnlos.setups import Setup
 _LOWEST = 1e-3
 
 
-def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, target_size_m: float = 0.08) -> str:
+def setup_section(name: str, setup: Setup | None) -> str:
     """Return the section that shows the setup; without one, how to have it shown."""
     warned = () if setup is None else setup.warnings()
     head = "<h2>The setup</h2>" + "".join(f"<p><b>Warning: {html.escape(line)}.</b></p>" for line in warned)
@@ -42,7 +42,7 @@ def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, target
             "<p class=dim>Steps of the wall&#x27;s fit, and what each took away of what was left of captures "
             f"held out, beside their noise: {html.escape(told)}.</p>"
         )
-    drawing = setup_drawing(setup, travel_m, target_size_m)
+    drawing = setup_drawing(setup)
     if drawing is None:
         words = html.escape(f"{name}: {setup.describe()}")
         return f"{head}<p>{words}. Where its parts stand is not known, so it has no drawing.</p>"

@@ -1,14 +1,13 @@
 """What is hidden and how it moves."""
 
 from evnlos.scene.databases import (
-    Handwritten,
     ObjectId,
     TargetPlane,
     list_emnist,
     list_sd19,
-    read_emnist,
+    read_emnist_images,
     read_picture,
-    read_sd19,
+    read_sd19_image,
 )
 from evnlos.scene.drawings import Film, closing_hand, drawing
 from evnlos.scene.fonts import (
@@ -38,7 +37,6 @@ from evnlos.scene.handwriting import (
     Ink,
     Strokes,
     hand,
-    held_out_writers,
     nist_like,
     pen_width,
     redrawn,
@@ -58,7 +56,6 @@ __all__ = [
     "Glyphs",
     "Hand",
     "HandwritingGlyphs",
-    "Handwritten",
     "Ink",
     "LineMotion",
     "Motion",
@@ -79,14 +76,13 @@ __all__ = [
     "find_font",
     "fit_to_target_plane",
     "hand",
-    "held_out_writers",
     "list_emnist",
     "list_sd19",
     "nist_like",
     "pen_width",
-    "read_emnist",
+    "read_emnist_images",
     "read_picture",
-    "read_sd19",
+    "read_sd19_image",
     "redrawn",
     "render_glyph",
     "with_others",

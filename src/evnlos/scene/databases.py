@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,20 +36,6 @@ ObjectId: TypeAlias = str
 _MAX_SIDE = 1024  # the official images have 128 pixels per side
 _PICTURES = (".png", ".jpg", ".jpeg", ".gif", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 _DARK = 1 / 255  # below it a picture is black
-
-
-class Handwritten(NamedTuple):
-    """One scanned character.
-
-    Args:
-        char: The character.
-        source: Where it comes from, unique within the database, e.g. "hsf_0_00012".
-        mask: Bright ink on dark ground, float32 [h, w], 0..1.
-    """
-
-    char: str
-    source: str
-    mask: NDArray[np.float32]
 
 
 def list_sd19(
@@ -97,6 +83,9 @@ def list_sd19(
 def read_sd19_image(path: str | Path) -> NDArray[np.float32]:
     """Read one image, black ink on white, as bright ink on dark ground, float32 [h, w], 0..1.
 
+    Args:
+        path: The image file of a copy of NIST SD19.
+
     Raises:
         DataError: The file is no image, or larger than any of the database.
     """
@@ -112,26 +101,6 @@ def read_sd19_image(path: str | Path) -> NDArray[np.float32]:
             f"{path} is no image that can be read ({error}); restore it from the database"
         ) from None
     return 1 - grey / np.float32(255)
-
-
-def read_sd19(
-    folder: str | Path,
-    characters: str = UPPER_CASE + DIGITS,
-    partition: str = "hsf_0",
-    first: int = 0,
-    count: int | None = None,
-) -> Iterator[Handwritten]:
-    """Yield the scanned characters that `list_sd19` lists, one image in memory at a time.
-
-    Args:
-        folder: The folder `by_class`, or the one that holds it.
-        characters: Characters to read.
-        partition: "hsf_0" .. "hsf_8", or "train".
-        first: How many of each character are passed over, at least 0.
-        count: How many of each character follow; None is all.
-    """
-    for char, source, path in list_sd19(folder, characters, partition, first, count):
-        yield Handwritten(char, source, read_sd19_image(path))
 
 
 _SIDE = 28
@@ -216,29 +185,6 @@ def read_emnist_images(
             batch = _read_exactly(stream, size * _SIDE * _SIDE, path).reshape(size, _SIDE, _SIDE)  # [b, 28, 28]
             for number in wanted[np.searchsorted(wanted, start) : np.searchsorted(wanted, start + size)]:
                 yield number, batch[number - start].T.astype(np.float32) / np.float32(255)
-
-
-def read_emnist(
-    folder: str | Path,
-    characters: str = UPPER_CASE + DIGITS,
-    subset: str = "byclass",
-    part: str = "train",
-    first: int = 0,
-    count: int | None = None,
-) -> Iterator[Handwritten]:
-    """Yield the characters that `list_emnist` lists, in the order of the file, in bounded memory.
-
-    Args:
-        folder: Folder with the official files, as for `list_emnist`.
-        characters: Characters to read.
-        subset: "byclass", "bymerge", "balanced", "letters" or "digits".
-        part: "train" or "test".
-        first: How many of each character are passed over, at least 0.
-        count: How many of each character follow; None is all.
-    """
-    chars = {number: char for char, number in list_emnist(folder, characters, subset, part, first, count)}
-    for number, mask in read_emnist_images(folder, list(chars), subset, part):
-        yield Handwritten(chars[number], f"{part}_{number:06d}", mask)
 
 
 def _file(root: Path, name: str, what: str) -> Path:

@@ -201,15 +201,15 @@ def _axis_name(axis: Any) -> str:
     return (name.decode() if isinstance(name, bytes) else name or "").strip("\0").casefold()
 
 
-def _font_of_file(path: Path, index: int = 0) -> Font:
+def _font_of_file(path: Path) -> Font:
     if not path.is_file():
         raise ConfigError(f"no font file {path}; give an existing .ttf or .otf file, or a family name")
     try:
-        family, style = ImageFont.truetype(str(path), 16, index=index).getname()
+        family, style = ImageFont.truetype(str(path), 16).getname()
     except OSError as error:
         raise ConfigError(f"{path} is no font that can be read ({error}); give a .ttf or .otf file") from error
     _, weight, italic = _split_name(f"x {style or ''}")
-    return Font(family or path.stem, path, weight, italic, index)
+    return Font(family or path.stem, path, weight, italic)
 
 
 def _packaged_fonts() -> Iterator[Font]:

@@ -153,8 +153,37 @@ class FontGlyphs:
         return [note] if note else []
 
 
+class _AsNamed:
+    """Sets whose images are what their names say."""
+
+    def notes(self) -> list[str]:
+        """Return nothing: nothing stands in for another."""
+        return []
+
+
+class _Copied(_AsNamed):
+    """Characters of the user's copy of a database, cut to their ink."""
+
+    characters: str
+    first: int
+    per_character: int
+    target_plane: TargetPlane
+
+    def __post_init__(self) -> None:
+        _check_characters(self.characters)
+        if self.first < 0 or self.per_character < 1:
+            raise ConfigError(
+                f"first is {self.first}, per_character {self.per_character}; give 0 or more and 1 or more"
+            )
+
+    def _fitted(self, object_id: ObjectId, char: str, image: NDArray) -> Target:
+        plane = self.target_plane
+        mask = fit_to_target_plane(image, plane.size_px, plane.fraction(char))
+        return Target(object_id, mask, plane.size_m)
+
+
 @dataclass(frozen=True)
-class NistGlyphs:
+class NistGlyphs(_Copied):
     """Characters of the user's own copy of NIST Special Database 19.
 
     Args:
@@ -175,10 +204,6 @@ class NistGlyphs:
     per_character: int = 39
     target_plane: TargetPlane = field(default_factory=TargetPlane)
 
-    def __post_init__(self) -> None:
-        _check_characters(self.characters)
-        _check_count(self.first, self.per_character)
-
     def objects(self) -> list[ObjectId]:
         """Return the names of all objects, e.g. "nist_hsf_0_00012_A"."""
         return list(_nist_index(self))
@@ -186,18 +211,11 @@ class NistGlyphs:
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one scanned character, cut to its ink and centred; the seed has no part in it."""
         char, path = look_up(_nist_index(self), object_id)
-        mask = fit_to_target_plane(
-            read_sd19_image(path), self.target_plane.size_px, self.target_plane.fraction(char)
-        )
-        return Target(object_id, mask, self.target_plane.size_m)
-
-    def notes(self) -> list[str]:
-        """Return nothing: the images are what their name says."""
-        return []
+        return self._fitted(object_id, char, read_sd19_image(path))
 
 
 @dataclass(frozen=True)
-class EmnistGlyphs:
+class EmnistGlyphs(_Copied):
     """Characters of the user's own copy of EMNIST.
 
     Args:
@@ -220,10 +238,6 @@ class EmnistGlyphs:
     per_character: int = 39
     target_plane: TargetPlane = field(default_factory=TargetPlane)
 
-    def __post_init__(self) -> None:
-        _check_characters(self.characters)
-        _check_count(self.first, self.per_character)
-
     def objects(self) -> list[ObjectId]:
         """Return the names of all objects, e.g. "emnist_byclass_train_000123_A"."""
         return list(_emnist_index(self))
@@ -231,14 +245,7 @@ class EmnistGlyphs:
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one character, cut to its ink, enlarged and centred; the seed has no part in it."""
         char, number = look_up(_emnist_index(self), object_id)
-        mask = fit_to_target_plane(
-            _emnist_images(self)[number], self.target_plane.size_px, self.target_plane.fraction(char)
-        )
-        return Target(object_id, mask, self.target_plane.size_m)
-
-    def notes(self) -> list[str]:
-        """Return nothing: the images are what their name says."""
-        return []
+        return self._fitted(object_id, char, _emnist_images(self)[number])
 
 
 @lru_cache(maxsize=16)
@@ -297,13 +304,8 @@ def _check_characters(characters: str) -> None:
         raise ConfigError(f"characters is {characters!r}; give each character once, and no spaces")
 
 
-def _check_count(first: int, per_character: int) -> None:
-    if first < 0 or per_character < 1:
-        raise ConfigError(f"first is {first}, per_character {per_character}; give 0 or more and 1 or more")
-
-
 @dataclass(frozen=True)
-class DrawingGlyphs:
+class DrawingGlyphs(_AsNamed):
     """Icons, people, vehicles, doodles, several things at once, and things in grey levels (see `drawing`).
 
     Args:
@@ -340,13 +342,9 @@ class DrawingGlyphs:
             object_id, drawing(kind, int(number), seed, self.target_plane.size_px), self.target_plane.size_m
         )
 
-    def notes(self) -> list[str]:
-        """Return nothing: no font stands in for another."""
-        return []
-
 
 @dataclass(frozen=True)
-class PictureGlyphs:
+class PictureGlyphs(_AsNamed):
     """The user's own pictures: each image of a folder is an object, of any size, taken in grey.
 
     White shines, black is dark, values between are shares of light; transparent pixels are black. The longer
@@ -371,10 +369,6 @@ class PictureGlyphs:
         path, plane = look_up(list_pictures(self.folder), object_id), self.target_plane
         return Target(object_id, read_picture(path, plane.size_px, plane.letter_fraction), plane.size_m)
 
-    def notes(self) -> list[str]:
-        """Return nothing: the pictures are what their names say."""
-        return []
-
 
 Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs | PictureGlyphs
 """All kinds of sets, distinguished by `kind` in a settings file."""
@@ -393,7 +387,14 @@ class OtherTarget:
 def with_others(
     scene: Scene, others: tuple[OtherTarget, ...], cover: bool, seed: int
 ) -> Scene | SeveralTargets:
-    """Return a scene with other targets beside its own, or itself where there are none."""
+    """Return a scene with other targets beside its own, or itself where there are none.
+
+    Args:
+        scene: The scene.
+        others: Targets beside its own, with motions of theirs.
+        cover: Whether a later target hides earlier ones.
+        seed: Seed of their drawing.
+    """
     drawn = [(one.glyphs.target(one.glyphs.objects()[0], seed), one.motion) for one in others]
     scenes = (scene, *(replace(scene, target=target, motion=motion) for target, motion in drawn))
     return SeveralTargets(scenes, cover) if others else scene

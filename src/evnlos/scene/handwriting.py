@@ -106,6 +106,7 @@ FACES = {"hand": BASE_FACES, "print": PRINT_FACES, "both": BASE_FACES + PRINT_FA
 """Base faces by name: pens, the rounded faces of signs and cut plates, or all of them."""
 
 TRAIN_WRITERS = 39
+"""Writers for training; later ones share their faces, but neither slant, proportions, pen nor deformation."""
 PEN = (0.06, 0.18)
 """Pen width as a part of the glyph's longer side: from a ball-point pen to a marker."""
 
@@ -117,18 +118,6 @@ _WAVES = 4  # cosines a direction and axis of the elastic deformation
 _HAND_BEND, _GLYPH_BEND = 0.045, 0.018  # amplitudes, as parts of the glyph's height
 _WORK_PX = 192
 _CANVAS_PX = 272  # room for strokes that are drawn before they are thinned
-
-
-def held_out_writers(count: int = 1) -> range:
-    """Return writers for testing: those after the 39 for training, which no training set may contain.
-
-    They share the base faces with the training writers, but neither slant, proportions, pen nor deformation.
-
-    Example:
-        >>> held_out_writers(3)
-        range(39, 42)
-    """
-    return range(TRAIN_WRITERS, TRAIN_WRITERS + count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +215,7 @@ def nist_like(
     handwriting.
 
     Args:
-        writer: Number of the writer, 0 or more (see `held_out_writers`).
+        writer: Number of the writer, 0 or more; those from `TRAIN_WRITERS` on are for testing.
         char: One character, A-Z, a-z or 0-9.
         seed: Seed of the population; the image depends on (seed, writer, char) and on nothing else.
         size_px: Side of the mask, pixels, 8 to 2048.

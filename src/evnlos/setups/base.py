@@ -7,7 +7,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, TypeVar
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -17,10 +18,11 @@ from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
 from evnlos.cameras.frame_camera import SensorSize
 from evnlos.errors import ConfigError
 from evnlos.optics import DepthTransport, LinearTransport, SeveralWall
+from evnlos.optics.facets import Pose
 from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
 from evnlos.scene import Ink, Scene, SeveralTargets
-from evnlos.setups.files import Layout, Measurement, OperatorNoise
+from evnlos.setups.files import Layout, Measurement, OperatorNoise, Parameter
 from evnlos.types import Irradiance, Plane
 
 S = TypeVar("S", bound="Setup")
@@ -31,32 +33,6 @@ LIGHT_FIELDS = ("gain", "ambient", "ambient_gradient")
 """Settings of a setup's light: they scale and add up, and change no geometry."""
 _PROBES = 65  # instants at which a scene's pose is looked at
 _SAME_ASPECT = 0.03  # difference of logarithms: images of whole pixels hardly keep a sensor's ratio
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A number of a setup that frames decide: what a calibration fits and a report prints.
-
-    Args:
-        name: Dotted name in the setup's settings, e.g. `roughness` or `offset_m.0`.
-        unit: Its unit; empty where it has none.
-        value: Its value, in the unit.
-        low: Smallest value that a search may take.
-        high: Largest value.
-        step: Step of a finite difference, in the unit, or relative to the value where `log`.
-        log: Whether a search runs over its logarithm.
-        role: "blur" or "magnification" for the two that a search scans before all others, "place" for the
-            place of the target's path; else empty.
-    """
-
-    name: str
-    unit: str
-    value: float
-    low: float
-    high: float
-    step: float
-    log: bool = False
-    role: Literal["", "blur", "magnification", "place"] = ""
 
 
 @dataclass(frozen=True)
@@ -240,6 +216,22 @@ class Setup(Kinded, ABC):
         """Return what each step of the setup's fit explains, and whether it is kept, by name; here none."""
         return {}
 
+    def wall_start(self) -> tuple[Pose, float, float] | None:
+        """Return camera and target, and the wall's roughness along x and y, that a fit of any wall begins with.
+
+        None where the kind states none.
+        """
+        return None
+
+    def kept_in(self: S, folder: Path, **findings: Any) -> S:
+        """Return the setup with its files in a folder, and with what a calibration found.
+
+        Args:
+            folder: The folder.
+            findings: Settings by name; a kind that has none of them leaves them out.
+        """
+        return self
+
     def wall_description(self) -> str:
         """Return what the wall is, in a few words."""
         return f"wall of a {self.kind} setup"
@@ -322,7 +314,7 @@ class Setup(Kinded, ABC):
 
         Images whose sides have the ratio of the sensor's are taken for its own, averaged.
         """
-        other = self.sensor.resized(shape).pixel_aspect
+        other = self.sensor.aspect_at(shape)
         is_own = abs(math.log(other / self.sensor.pixel_aspect)) < _SAME_ASPECT
         return self.resized(shape) if is_own else replace(self, sensor=SensorSize(*shape))
 

@@ -11,7 +11,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -52,6 +52,32 @@ class OperatorNoise(NamedTuple):
     """Whether cells have independent noise: not after denoising, nor for a point-spread function."""
     pitch_m: float
     """Side of the cells that were measured, metres."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a setup that frames decide: what a calibration fits and a report prints.
+
+    Args:
+        name: Dotted name in the setup's settings, e.g. `roughness` or `offset_m.0`.
+        unit: Its unit; empty where it has none.
+        value: Its value, in the unit.
+        low: Smallest value that a search may take.
+        high: Largest value.
+        step: Step of a finite difference, in the unit, or relative to the value where `log`.
+        log: Whether a search runs over its logarithm.
+        role: "blur" or "magnification" for the two that a search scans before all others, "place" for the
+            place of the target's path; else empty.
+    """
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    step: float
+    log: bool = False
+    role: Literal["", "blur", "magnification", "place"] = ""
 
 
 @dataclass(frozen=True)
@@ -266,6 +292,8 @@ WALL = TensorFile(
     "the file that `evnlos calibrate` wrote beside setup.yaml",
 )
 """Fitted walls on disk."""
+WALL_FILE = "wall.safetensors"
+"""Name of a fitted wall's file in the folder of `evnlos calibrate`."""
 
 
 def write_fitted(path: str | Path, wall: FittedWall) -> str:

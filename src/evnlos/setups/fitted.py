@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.config import BESIDE
 from evnlos.errors import ConfigError
+from evnlos.files import write_atomically
 from evnlos.optics import MatrixTransport, MatrixWall, coarsest_keyframe_step_m
 from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.facets import Pose, SlopeTable, facet_matrix, seen_points
 from evnlos.optics.wall import ambient_map, ambient_plane
 from evnlos.scene import Ink, Scene, Target
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
-from evnlos.setups.files import WALL, FittedWall
+from evnlos.setups.files import WALL, WALL_FILE, FittedWall
 from evnlos.setups.measured import covered
 from evnlos.types import Plane
 
@@ -95,20 +96,16 @@ class FittedSetup(Setup):
             raise ConfigError("setup.file is empty; give the .safetensors file of `evnlos calibrate`")
         return WALL.load(self.file, self.checksum)
 
+    def kept_in(self, folder: Path, **findings: Any) -> FittedSetup:
+        """Return the setup with the wall's file in a folder, and what was found."""
+        path = (folder / WALL_FILE).resolve()
+        if Path(self.file).resolve() != path:
+            write_atomically(path, Path(self.file).read_bytes())
+        return replace(self, file=str(path), **findings)
+
     def pose(self) -> Pose:
         """Return where camera, wall and target are."""
-        return Pose(
-            self.camera_distance_m,
-            self.camera_angle_deg,
-            self.camera_elevation_deg,
-            self.camera_roll_deg,
-            self.field_of_view_deg,
-            self.distortion,
-            self.distance_m,
-            self.target_offset_m,
-            self.travel_slope,
-            self.curvature_per_m,
-        )
+        return Pose(**{one.name: getattr(self, one.name) for one in fields(Pose)})
 
     def table(self) -> SlopeTable:
         """Return the density of the facets' slopes."""
@@ -163,7 +160,7 @@ class FittedSetup(Setup):
         """
         fitted = self.fitted()
         kind = np.float32 if dtype == torch.float32 else np.float64
-        aspect = self.sensor.resized(shape).pixel_aspect
+        aspect = self.sensor.aspect_at(shape)
         made = facet_matrix(self.pose(), self.table(), shape, source, kind, pixel_aspect=aspect)
         matrix = torch.from_numpy(made)
         matrix *= fitted.image("sensitivity", shape).flatten().to(matrix)[:, None]
@@ -295,7 +292,7 @@ class FittedSetup(Setup):
 
     def magnification_px_m(self, shape: tuple[int, int]) -> float:
         """Return an upper bound of the image motion, pixels per metre of the target's."""
-        return _magnification_px_m(self.pose(), shape, self.sensor.resized(shape).pixel_aspect)
+        return _magnification_px_m(self.pose(), shape, self.sensor.aspect_at(shape))
 
     def _along(self, shape: tuple[int, int]) -> tuple[MatrixTransport, Target] | None:
         """Return matrix and image of what moves along; None where nothing shines beside the target."""

@@ -81,7 +81,7 @@ class PaperSetup(Setup):
     def view(self, shape: tuple[int, int]) -> View:
         """Return the camera's view for an image of `shape` (H, W), pixels."""
         check_lengths(field_of_view_m=self.field_of_view_m, camera_distance_m=self.camera_distance_m)
-        pixels = self.sensor.resized(shape).pixel_aspect
+        pixels = self.sensor.aspect_at(shape)
         if self.camera_angle_deg:
             fov = 2 * math.atan(self.field_of_view_m / 2 / self.camera_distance_m)
             angle = math.radians(self.camera_angle_deg)

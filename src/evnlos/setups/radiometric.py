@@ -25,6 +25,7 @@ from evnlos.optics import (
     light_transport_matrix,
 )
 from evnlos.optics.angular_spectrum import check_lengths
+from evnlos.optics.facets import Pose
 from evnlos.optics.view import check_between, check_sight
 from evnlos.scene import Scene
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
@@ -96,7 +97,7 @@ class RadiometricSetup(Setup):
     def view(self, shape: tuple[int, int]) -> View:
         """Return the camera's view for an image of `shape` (H, W), pixels."""
         angle, fov = math.radians(self.camera_angle_deg), math.radians(self.field_of_view_deg)
-        aspect = self.sensor.resized(shape).pixel_aspect
+        aspect = self.sensor.aspect_at(shape)
         return View.perspective(shape, self.camera_distance_m, angle, fov, pixel_aspect=aspect)
 
     def target_cells(self) -> Plane:
@@ -114,6 +115,17 @@ class RadiometricSetup(Setup):
         if self.target_offset_m is not None:
             return self.target_offset_m
         return -self.distance_m * math.tan(math.radians(self.camera_angle_deg)), 0.0
+
+    def wall_start(self) -> tuple[Pose, float, float]:
+        """Return camera and target, and the roughness along x and y."""
+        pose = Pose(
+            camera_distance_m=self.camera_distance_m,
+            camera_angle_deg=self.camera_angle_deg,
+            field_of_view_deg=self.field_of_view_deg,
+            distance_m=self.distance_m,
+            target_offset_m=self.offset_m(),
+        )
+        return pose, self.roughness, self.roughness_y or self.roughness
 
     def occluders(self) -> tuple[Occluder, ...]:
         """Return what stands between wall and target."""

@@ -244,7 +244,7 @@ class RoomSetup(Setup):
                 self.vignetting,
                 self.curvature,
                 self.rays,
-                self.sensor.resized(shape).pixel_aspect,
+                self.sensor.aspect_at(shape),
             )
         )
         if (rays.eye[..., 2] < _GRAZING).any():

@@ -34,6 +34,7 @@ from evnlos.types import derive_seed
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Shares of the way from the pre-trained to the fine-tuned weights that are tried."""
 
+_FOLDS = 2
 CHOICE = "choice.json"
 """Name of the file, in the run's folder, that says what was chosen."""
 
@@ -97,45 +98,44 @@ def choose_and_finetune(
     candidates: tuple[Training, ...],
     out: str | Path,
     weights: str | Path,
-    folds: int = 2,
     progress: Progress = silent,
 ) -> TrainingResult:
     """Fine-tune weights on captures as is best for captures held out, or leave them as they are.
 
-    The training objects are dealt into folds. For each candidate and fold the weights are fine-tuned on the
-    other folds; weights between the old and the new ones, (1 - a) old + a new, are scored on the fold
-    (Wortsman et al., Robust fine-tuning of zero-shot models, CVPR 2022). The best candidate and share `a` are
-    taken if they gain more than a standard error over the objects, and then used on all training objects.
+    The training objects are dealt into two folds; of fewer than two objects nothing is learned. For each
+    candidate and fold the weights are fine-tuned on the other fold; weights between the old and the new ones,
+    (1 - a) old + a new, are scored on the fold (Wortsman et al., Robust fine-tuning of zero-shot models, CVPR
+    2022). The best candidate and share `a` are taken if they gain more than a standard error over the objects,
+    and then used on all training objects.
 
     Args:
         dataset: Captures; the split `train` is dealt into folds and learned from, no other is read.
         candidates: One or more; any but the first is left out where the captures are too few for it.
         out: Folder of the run, as of `train`, with `choice.json` beside the weights.
         weights: Weights or run to start from.
-        folds: Parts of the training objects, 2 or more; with fewer objects than 2 nothing is fine-tuned.
         progress: As of `train`.
 
     Returns:
         The run; `read_choice` tells what was chosen.
 
     Raises:
-        ConfigError: No candidate, or fewer than two folds.
+        ConfigError: No candidate.
         DataError: As of `train`.
     """
-    if not candidates or folds < 2:
-        raise ConfigError(f"{len(candidates)} candidates in {folds} folds; give at least 1 in at least 2")
+    if not candidates:
+        raise ConfigError("there are no candidates; give at least 1")
     out = Path(out)
     trials = out.with_name(f"{out.name}-trials")
     start = load_weights(weights)
     about = about_run(dataset, candidates[0], start)
-    about |= {"candidates": [to_dict(settings) for settings in candidates], "folds": folds}
+    about |= {"candidates": [to_dict(settings) for settings in candidates], "folds": _FOLDS}
     with directory_lock(out, check=lambda: check_run(out, about)):
         if (out / "weights.safetensors").is_file():
             log = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
             return TrainingResult(out, log)
         save_yaml(about, out / "run.yaml")
         start.network.sampling = start.sampling.corrected_as(dataset.sampling)
-        gains = _cross_validated(dataset, candidates, trials, weights, start, folds, progress)
+        gains = _cross_validated(dataset, candidates, trials, weights, start, progress)
         choice = _choice(gains)
         if choice.candidate is None:
             result, network, log = start, start.network, list[dict[str, Any]]()
@@ -205,13 +205,12 @@ def _cross_validated(
     trials: Path,
     weights: str | Path,
     start: Weights,
-    folds: int,
     progress: Progress,
 ) -> NDArray[np.float64]:
     """Return the gain over the old weights in dB, [candidate, share, object], each object when held out."""
     objects = dataset.objects("train")
     order = np.random.default_rng(derive_seed(candidates[0].seed, "folds")).permutation(len(objects))
-    parts = [part for part in np.array_split(order, folds) if len(part)]
+    parts = [part for part in np.array_split(order, _FOLDS) if len(part)]
     gains = np.zeros((len(candidates), len(SHARES), len(objects)))
     if len(parts) < 2:
         return gains

@@ -214,7 +214,12 @@ def measured_cells(info: ScanInfo) -> NDArray[np.int64]:
 
 
 def lit_cells(info: ScanInfo, pattern: int) -> NDArray[np.bool_]:
-    """Return which cells a pattern lights, [h, w]."""
+    """Return which cells a pattern lights, [h, w].
+
+    Args:
+        info: The scan.
+        pattern: Number of the pattern.
+    """
     lit = np.zeros(info.plane.height * info.plane.width, np.bool_)
     lit[measured_cells(info)] = Patterns(info.pattern, info.patterns.cells).row(pattern)
     return lit.reshape(info.plane.shape)
@@ -244,6 +249,9 @@ def displayed(
 def read_scan_info(folder: str | Path) -> ScanInfo:
     """Read the `scan.yaml` of a folder.
 
+    Args:
+        folder: The scan's folder.
+
     Raises:
         ConfigError: Folder or file is missing, or it has an unknown key, a wrong type or a value out of range.
     """
@@ -267,6 +275,10 @@ def write_scan_frames(path: Path, scan_frames: list[ScanFrame]) -> None:
 
 def read_scan_frames(folder: str | Path, info: ScanInfo) -> list[ScanFrame]:
     """Read and check the table of images: every pattern in every repeat, once, and dark frames.
+
+    Args:
+        folder: The scan's folder.
+        info: The scan, as its `scan.yaml` says.
 
     Raises:
         DataError: The table is missing or garbled, or a pattern or the dark frames are missing.

@@ -213,6 +213,9 @@ PAIRS = ((1, 2), (3, 4), (5, 6), (8, 9))
 def read_show(folder: str | Path) -> Show:
     """Read the show of a scan's folder.
 
+    Args:
+        folder: The folder.
+
     Raises:
         ConfigError: show.yaml is missing, or has an unknown key, a wrong type or a value out of range.
     """

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -133,7 +134,31 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-class ExactArray(EventModel):
+class TiledArray(EventModel):
+    """Pixels that run tile by tile; a derived class keeps `_state`, arrays of all pixels, and has `_run`."""
+
+    _state: tuple
+    _tile_px: int
+    _threads: int
+    _time: float
+
+    @abstractmethod
+    def _run(self, times: NDArray[np.float64]) -> Callable[..., Columns]:
+        """Return what makes events of the frames at these instants, their first pixel, and a share's ends."""
+
+    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
+        """Take the next light at `times_s` [T] and return the events in order."""
+        run = self._run(np.concatenate([[self._time], times_s]))
+
+        def work(first: int, last: int) -> Columns:
+            return run(*light.pixels(first, last), first, last)
+
+        tiles = list(map_shares(work, len(self._state[0]), self._tile_px, self._threads, light.most_px))
+        self._time = float(times_s[-1])
+        return sort_times(*joined(tiles))
+
+
+class ExactArray(TiledArray):
     """Pixels that see light which is linear in time between the frames; `advance` them frame by frame."""
 
     def __init__(
@@ -191,19 +216,11 @@ class ExactArray(EventModel):
         )
         self._time = time_s
 
-    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
-        """Take the next light at `times_s` [T] and return the events in order."""
-        times = np.concatenate([[self._time], times_s])
-
-        def work(first: int, last: int) -> Columns:
-            frames, origin = light.pixels(first, last)
-            return continuous.run_tiles(
-                frames, origin, times, first, last, self._tile_px, self._state, self._pixels, self._law
-            )
-
-        tiles = list(map_shares(work, len(self._state.base), self._tile_px, self._threads, light.most_px))
-        self._time = float(times_s[-1])
-        return sort_times(*joined(tiles))
+    def _run(self, times: NDArray[np.float64]) -> Callable[..., Columns]:
+        what = self._tile_px, self._state, self._pixels, self._law
+        return lambda frames, origin, first, last: continuous.run_tiles(
+            frames, origin, times, first, last, *what
+        )
 
 
 _DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0

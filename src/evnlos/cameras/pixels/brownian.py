@@ -19,6 +19,7 @@ distance); this module draws from the equation.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -37,7 +38,7 @@ from evnlos.cameras.event_model import (
     check_phase,
     require,
 )
-from evnlos.cameras.pixels.arrays import check_tiling, map_shares, pixel_thresholds
+from evnlos.cameras.pixels.arrays import TiledArray, check_tiling, pixel_thresholds
 from evnlos.cameras.random_numbers import (
     STREAM_BARRIER,
     STREAM_LEAK_PHASE,
@@ -49,7 +50,7 @@ from evnlos.cameras.random_numbers import (
     random_normals,
     random_uniform,
 )
-from evnlos.cameras.streams import Columns, Light, grown, joined, sort_times
+from evnlos.cameras.streams import Columns, grown
 from evnlos.errors import ConfigError
 
 _SAFE = 8.0
@@ -449,18 +450,8 @@ class BrownianPixel(ThresholdPixel):
             exposure=self.exposure,
         )
 
-    def drift_and_noise(self, light_dn: float) -> tuple[float, float]:
-        """Return the drift by leak, log units per s, and the noise, log units per sqrt(s), in constant light.
 
-        Args:
-            light_dn: Light at the pixel, DN.
-        """
-        drift = self.threshold_on * (self.leak_rate_hz + self.leak_rate_per_dn_hz * light_dn)
-        noise = self.photon_noise * math.sqrt(light_dn) / (light_dn + self.dark_dn) + self.dark_noise
-        return drift, noise
-
-
-class BrownianArray(EventModel):
+class BrownianArray(TiledArray):
     """An array of `BrownianPixel`s."""
 
     def __init__(
@@ -497,17 +488,6 @@ class BrownianArray(EventModel):
         self._state = State(light, mean, mean.copy(), mean.copy(), np.zeros(count), *counters)
         self._time = time_s
 
-    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
-        """Take the next light at `times_s` [T] and return the events in order."""
-        times = np.concatenate([[self._time], times_s])
-
-        def work(first: int, last: int) -> Columns:
-            frames, origin = light.pixels(first, last)
-            return run_tiles(
-                frames, origin, times, first, last, self._tile_px, self._state, self._on, self._off, self._law
-            )
-
-        count = len(self._state.light)
-        tiles = list(map_shares(work, count, self._tile_px, self._threads, light.most_px))
-        self._time = float(times_s[-1])
-        return sort_times(*joined(tiles))
+    def _run(self, times: NDArray[np.float64]) -> Callable[..., Columns]:
+        what = self._tile_px, self._state, self._on, self._off, self._law
+        return lambda frames, origin, first, last: run_tiles(frames, origin, times, first, last, *what)

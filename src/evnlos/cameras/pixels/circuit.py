@@ -22,6 +22,7 @@ same mean lag, and that of the same variance and correlation time as the three e
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -42,7 +43,7 @@ from evnlos.cameras.event_model import (
     noise_lead,
     require,
 )
-from evnlos.cameras.pixels.arrays import check_tiling, map_shares, pixel_thresholds
+from evnlos.cameras.pixels.arrays import TiledArray, check_tiling, pixel_thresholds
 from evnlos.cameras.random_numbers import (
     STREAM_CIRCUIT,
     STREAM_CIRCUIT_START,
@@ -55,7 +56,7 @@ from evnlos.cameras.random_numbers import (
     settled_reference,
     stationary,
 )
-from evnlos.cameras.streams import Columns, Light, grown, joined, sort_times
+from evnlos.cameras.streams import Columns, grown
 from evnlos.errors import ConfigError
 
 LEVEL = 0.02
@@ -495,7 +496,7 @@ class CircuitPixel(ThresholdPixel):
         return CircuitArray(self, shape, seed, thresholds, 1024 if tile_px is None else tile_px, threads)
 
 
-class CircuitArray(EventModel):
+class CircuitArray(TiledArray):
     """An array of `CircuitPixel`s."""
 
     def __init__(
@@ -576,9 +577,7 @@ class CircuitArray(EventModel):
         self._state = State(x, np.zeros((count, 3)), noise, x + above, *rest)
         self._time = time_s
 
-    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
-        """Take the next light at `times_s` [T] and return the events in order."""
-        times = np.concatenate([[self._time], times_s])
+    def _run(self, times: NDArray[np.float64]) -> Callable[..., Columns]:
         lengths = np.diff(times)
         steps = np.maximum(1, np.ceil(lengths / self._longest - 1e-9)).astype(np.int64)
         keys = [float(f"{h:.9g}") for h in lengths / steps]
@@ -586,15 +585,11 @@ class CircuitArray(EventModel):
         tables = [self._table(key) for key in distinct]
         stacked = type(tables[0])(*map(np.stack, zip(*tables, strict=True)))
         which = np.array([distinct.index(key) for key in keys])
-
-        def work(first: int, last: int) -> Columns:
-            frames, origin = light.pixels(first, last)
-            where = frames, origin, times, steps, first, last
-            what = self._state, stacked, which, self._pixel
-            if self.settings.poles == 3:
-                return run_frames(*where, *what)
-            return run_poles(*where, self._tile_px, *what)
-
-        tiles = list(map_shares(work, len(self._state.x), self._tile_px, self._threads, light.most_px))
-        self._time = float(times_s[-1])
-        return sort_times(*joined(tiles))
+        what = self._state, stacked, which, self._pixel
+        if self.settings.poles == 3:
+            return lambda frames, origin, first, last: run_frames(
+                frames, origin, times, steps, first, last, *what
+            )
+        return lambda frames, origin, first, last: run_poles(
+            frames, origin, times, steps, first, last, self._tile_px, *what
+        )

@@ -191,7 +191,6 @@ TOPIC, IMAGE_TOPIC = "/event_camera/events", "/event_camera/image"
 _MOST_SIDES = 1 << 16, 1 << 15  # x has 16 bits, y has 15
 _MOST_US = 2**31 * 10**6  # a ROS stamp has 31 bits of seconds
 _PACKET = 1 << 14  # events
-_PACKET_US = 4_000_000  # 32 bits of nanoseconds hold 4.29 s
 _IMAGE_US = 40_000
 _CHUNK_BYTES = 1 << 20
 _DARK, _ON, _OFF = (24, 24, 28), (255, 150, 40), (70, 140, 255)

@@ -121,7 +121,12 @@ class FrameStack:
 
 
 def frame_blocks(frames: NDArray | FrameStack, size: int = 32) -> Iterator[NDArray]:
-    """Yield frames [N, H, W] in blocks of at most `size`, whether they are held or read."""
+    """Yield frames [N, H, W] in blocks of at most `size`, whether they are held or read.
+
+    Args:
+        frames: The frames, [N, H, W].
+        size: Most frames of a block.
+    """
     if isinstance(frames, FrameStack):
         return frames.blocks(size)
     return (frames[at : at + size] for at in range(0, len(frames), size))
@@ -138,7 +143,15 @@ def iter_frames(
 ) -> Iterator[tuple[int | None, NDArray]]:
     """Yield time (microseconds, None where the file has none) and image of each frame of a file.
 
-    Memory does not grow with the number of frames, but for CeleX-V. Arguments and errors as of `read_frames`.
+    Memory does not grow with the number of frames, but for CeleX-V. Errors are those of `read_frames`.
+
+    Args:
+        path: The file.
+        bits: As of `read_frames`, like all that follow.
+        fpn: See there.
+        on_error: See there.
+        celex: See there.
+        topic: See there.
     """
     path = Path(path)
     check_on_error(on_error)
