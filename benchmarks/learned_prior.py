@@ -6,8 +6,7 @@ The light path is that of a setup, whose frames of one sequence say A and b of a
 drawn exactly as the frames' noise has it, at the light of the setup and at less. Targets are letters by hands
 that are held out, and drawings of other numbers than those learned from. Printed, of each: PSNR on the target's
 cells of the Gaussian estimate, of the mean of the learned prior's samples and of one sample; the share of cells
-within the 90 % interval of the samples, of all and of those that are open (intervals above 0.2), and how many
-are open.
+within the 90 % interval of the samples, of all and of open ones (intervals above 0.2), and how many are open.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
+from evnlos.optics.radiometric import STRICT
 
 Array = NDArray[np.float64]
 
@@ -153,7 +154,7 @@ def slope_density(u: float, v: float, table: Array) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@njit(cache=True, error_model="numpy", fastmath=STRICT)
 def add_density(total: Array, factor: Array, u: Array, v: Array, lobe: Array) -> None:
     """Add factor P(u, v) of one lobe, a row of `Reflection.table`, to `total`: all four are [C]."""
     kind, scale = lobe[0], lobe[1]
@@ -333,7 +334,7 @@ def _meet(origin: Array, ray: Array, curvature: tuple[float, float]) -> Array:
         return origin + t[..., None] * ray
 
 
-@njit(cache=True, error_model="numpy", fastmath=True)
+@njit(cache=True, error_model="numpy", fastmath=STRICT)
 def _add_ray(
     total: Array,
     facet: Array,

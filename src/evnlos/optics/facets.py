@@ -18,13 +18,13 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
-from evnlos.optics.radiometric import noted_rows, torchs_threads
+from evnlos.optics.radiometric import STRICT, noted_rows, torchs_threads
 from evnlos.types import Plane
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=STRICT, inline="always")
 def _pair(point: Array, frame: Array, eye: Array, cx: float, cy: float, cz: float, masking: float):
     """Return slopes (x, y) of the half vector, the facets' factor but for their density, the matte one."""
     dx, dy, dz = cx - point[0], cy - point[1], cz - point[2]
@@ -45,7 +45,7 @@ def _pair(point: Array, frame: Array, eye: Array, cx: float, cy: float, cz: floa
     return sx, sy, seen * lit * bent * bent / (4.0 * eye[2]) * fall, iz * fall / math.pi
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=STRICT, inline="always")
 def _place(sx: float, sy: float, scale: float, step: float, nodes: int):
     """Return the table's coordinates of a slope: its length is stretched by asinh, its direction is kept."""
     length = math.sqrt(sx * sx + sy * sy)
@@ -60,7 +60,7 @@ def _place(sx: float, sy: float, scale: float, step: float, nodes: int):
     return a, b
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=STRICT, inline="always")
 def _value(table: Array, a: float, b: float) -> float:
     """Return the quadratic B-spline with the table's coefficients."""
     i, j = math.floor(a + 0.5), math.floor(b + 0.5)
@@ -74,7 +74,7 @@ def _value(table: Array, a: float, b: float) -> float:
     return total
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=STRICT, parallel=True)
 def fill_facets(
     out: NDArray,
     points: Array,
@@ -113,7 +113,7 @@ def fill_facets(
             out[p, q] = area * (glossy * math.exp(_value(table, a, b)) + matte * dull)
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=STRICT, parallel=True)
 def carry_facets(
     out: NDArray,
     points: Array,
@@ -164,7 +164,7 @@ def carry_facets(
             out[p, n] = total
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=STRICT, parallel=True)
 def facet_slopes(
     out: NDArray,
     points: Array,
@@ -234,7 +234,7 @@ def facet_slopes(
                 out[p, n, c] = acc[c]
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=STRICT, parallel=True)
 def carry_lobes(
     out: NDArray,
     points: Array,

@@ -23,8 +23,12 @@ from evnlos.types import Plane
 Array = NDArray[np.float64]
 Ends = NDArray[np.int64]
 
+STRICT = {"nnan", "ninf", "nsz", "contract"}
+"""What kernels take for granted: finite numbers, a zero without a sign. Sums stay in their order: else a
+kernel that was compiled just now and the same from the cache would differ in their last bits."""
 
-@njit(cache=True, fastmath=True, inline="always", error_model="numpy")
+
+@njit(cache=True, fastmath=STRICT, error_model="numpy")
 def _fresnel(cosine: float, n: float, k: float) -> float:
     c2 = cosine * cosine
     s2 = 1.0 - c2
@@ -38,27 +42,28 @@ def _fresnel(cosine: float, n: float, k: float) -> float:
     return 0.5 * (across + along)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=STRICT, error_model="numpy")
 def _metal_row(value: Array, dx: Array, dy: float, z: float, eye: Array, metal: Array) -> None:
     """Set f cos cos / r^2 of a rough metal for one wall point and one row of target points."""
     ax, ay, n, k = metal[0], metal[1], metal[2], metal[3]
     ox, oy, oz = eye[0], eye[1], eye[2]
     seen = 2.0 / (1.0 + math.sqrt(1.0 + ((ax * ox) ** 2 + (ay * oy) ** 2) / (oz * oz)))
     # 1 / (4 cos i cos o) loses its cos i to one of the two cosines of the geometry.
-    scale = seen / (4.0 * oz * math.pi * ax * ay)
+    scale = 2.0 * z * seen / (4.0 * oz * math.pi * ax * ay)
+    steep_x, steep_y = 1.0 / (ax * ax), 1.0 / (ay * ay)
+    flat_x, flat_y = (ax / z) ** 2, (ay * dy / z) ** 2
     for c in range(value.size):
-        r2 = dx[c] * dx[c] + dy * dy + z * z
+        square = dx[c] * dx[c]
+        r2 = square + dy * dy + z * z
         inverse = 1.0 / math.sqrt(r2)
-        ix, iy, iz = dx[c] * inverse, dy * inverse, z * inverse
-        hx, hy, hz = ix + ox, iy + oy, iz + oz
+        hx, hy, hz = dx[c] * inverse + ox, dy * inverse + oy, z * inverse + oz
         squared = hx * hx + hy * hy + hz * hz
-        stretched = (hx / ax) ** 2 + (hy / ay) ** 2 + hz * hz
-        distribution = (squared / stretched) ** 2
-        masking = 2.0 / (1.0 + math.sqrt(1.0 + ((ax * ix) ** 2 + (ay * iy) ** 2) / (iz * iz)))
-        value[c] = scale * distribution * masking * _fresnel(0.5 * math.sqrt(squared), n, k) * iz / r2
+        ratio = squared / (hx * hx * steep_x + hy * hy * steep_y + hz * hz)  # its square is the distribution
+        unmasked = 1.0 + math.sqrt(1.0 + square * flat_x + flat_y)
+        value[c] = scale * ratio * ratio * _fresnel(0.5 * math.sqrt(squared), n, k) * inverse / (r2 * unmasked)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=STRICT, error_model="numpy")
 def _matte_row(value: Array, dx: Array, dy: float, z: float, albedo: float) -> None:
     """Set f cos cos / r^2 of a matte wall for one wall point and one row of target points."""
     scale = albedo / math.pi * z * z
@@ -189,7 +194,7 @@ def fill_matrix(
                 out[p, r * width + c] = total[r, c] * emission[r * width + c]
 
 
-_PARTS = 16  # of a light path, so that progress moves
+_PARTS, _FEWEST = 16, 2048  # of a light path, so that progress moves; pixels of one: each costs a millisecond
 
 
 def noted_rows(pixels: int) -> Iterator[slice]:
@@ -198,7 +203,7 @@ def noted_rows(pixels: int) -> Iterator[slice]:
     Args:
         pixels: How many there are.
     """
-    size = max(64, math.ceil(pixels / _PARTS))
+    size = max(_FEWEST, math.ceil(pixels / _PARTS))
     for start in range(0, pixels, size):
         note(f"light path, {start} of {pixels} pixels")
         yield slice(start, start + size)
