@@ -77,6 +77,50 @@ def time_surface_reference(
     return out
 
 
+def causal_trace_reference(
+    events: Events, edges_us: NDArray[np.int64], tau_us: float, law: TraceLaw
+) -> NDArray[np.float64]:
+    """Return what the causal `event_trace` returns, from covariances of x at two instants, event by event."""
+    begin = int(events.t_us[0]) - 1
+    out = np.zeros((len(edges_us) - 1, 2, events.height, events.width))
+
+    def given(mean: float, variance: float, elapsed: float, change: float, error: float) -> tuple:
+        """Return mean and variance of x where its change was seen with an error, and how likely that was."""
+        phi = np.exp(-elapsed / tau_us)
+        walk = law.spread**2 * (1 - phi**2)
+        before, now = np.array([1.0, 0.0]), np.array([phi, 1.0])  # of the last x and the noise since
+        own, step = np.diag([variance, walk]), now - before
+        middle = np.array([mean, 0.0])
+        seen = step @ own @ step + error
+        gain = own @ step / seen
+        middle = middle + gain * (change - step @ middle)
+        likely = np.exp(-((change - step @ np.array([mean, 0.0])) ** 2) / (2 * seen)) / np.sqrt(seen)
+        own = own - np.outer(gain, step @ own)
+        return now @ middle, now @ own @ now, likely
+
+    for row in range(events.height):
+        for column in range(events.width):
+            mine = (events.x == column) & (events.y == row)
+            for grid, edge in enumerate(edges_us[1:]):
+                mean, variance, last = 0.0, law.spread**2, begin
+                for number, (t, on) in enumerate(zip(events.t_us[mine], events.p[mine], strict=True)):
+                    if t > edge:
+                        break
+                    aim, error = (1.0, law.crossing) if number else (0.5, law.quiet)
+                    sign = 1.0 if on else -1.0
+                    each = [given(mean, variance, t - last, sign * aim, error)]
+                    each.append(given(mean, variance, t - last, 0.0, law.quiet))
+                    weights = np.array([(1 - law.noise) * each[0][2], law.noise * each[1][2]])
+                    weights /= weights.sum()
+                    means, variances = (np.array([one[k] for one in each]) for k in (0, 1))
+                    mean = weights @ means
+                    variance, last = weights @ (variances + (means - mean) ** 2), t
+                x, spread, _ = given(mean, variance, edge - last, 0.0, law.quiet)
+                known = 1 - spread / law.spread**2
+                out[grid, :, row, column] = (known + x) / 2, (known - x) / 2
+    return out
+
+
 def event_trace_reference(
     events: Events, edges_us: NDArray[np.int64], tau_us: float, law: TraceLaw
 ) -> NDArray[np.float64]:

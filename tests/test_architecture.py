@@ -105,6 +105,7 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",
+    "events/batch.py",
     "events/files/aedat.py",
     "inverse/corner.py",
     "lab/light_path.py",

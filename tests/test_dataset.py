@@ -35,8 +35,10 @@ from evnlos.data.pool import run_tasks
 from evnlos.data.simulate import drawn_for, split_of
 from evnlos.data.simulations import find_faults, repair
 from evnlos.errors import ConfigError, DataError, EvnlosError
+from evnlos.models import UNetConfig
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
+from evnlos.training import Training, train
 from evnlos.training.source import DiskSource, ProcessGroup
 from watching import Watch, always_die, die_once, stopped
 
@@ -290,6 +292,21 @@ def test_modalities_are_one_switch(tiny_dataset) -> None:
     assert (seen.shape, truth.shape) == ((3, 32, 48), (1, 32, 48))
     with pytest.raises(ConfigError, match="modality"):
         as_modality("sound")
+
+
+def test_the_trace_stands_beside_the_surface_and_networks_of_single_time_steps_see_it(tiny, tmp_path) -> None:
+    sampling = replace(tiny.sampling, surface="sae-trace")
+    glyphs = replace(tiny.glyphs, characters="AB", writers=1)
+    made = simulate(replace(tiny, glyphs=glyphs, sampling=sampling, validation=0.0), tmp_path / "data")
+    plain = as_modality("event")
+    both, alone = (NlosDataset(made, "train", one) for one in (plain.seeing("sae-trace"), plain))
+    np.testing.assert_array_equal(both.inputs[:, :2], alone.inputs)
+    assert both.inputs.shape[1] == 4 and both.inputs[:, 2:].any()
+    assert pickle.loads(pickle.dumps(both)).modality.layout == {"events": 2, "trace": 2}
+    assert as_modality("frame").seeing("sae-trace") == as_modality("frame") != plain == plain.seeing("sae")
+    settings = Training(modality="event", epochs=1, network=UNetConfig(width=8, depth=1, rank=8))
+    trained = train(made, settings, tmp_path / "run").load()
+    assert trained.modality.layout == {"events": 2, "trace": 2} and trained.modality.name == "event"
 
 
 def test_a_network_is_given_levels_as_they_were_measured() -> None:

@@ -435,8 +435,9 @@ def test_presets_are_whole(name) -> None:
 @pytest.mark.parametrize("name", ["frozen", "capture-count", "surface", "thresholds", "loss", "width"])
 def test_a_study_of_single_positions_has_a_sequence_twin(name) -> None:
     single, twin = STUDIES[name]("near"), on_sequences(STUDIES[name]("near"))
-    assert twin.name == f"{name}-sequence" and [a.name for a in twin.arms] == [a.name for a in single.arms]
-    for before, after in zip(single.arms, twin.arms, strict=True):
+    arms = [arm for arm in single.arms if arm.sampling.surface != "sae-trace"]  # which sequences do not see
+    assert twin.name == f"{name}-sequence" and [a.name for a in twin.arms] == [a.name for a in arms]
+    for before, after in zip(arms, twin.arms, strict=True):
         first, was = after.pretraining or after.finetuning, before.pretraining or before.finetuning
         assert (
             first.network.kind == "sequence"

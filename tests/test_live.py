@@ -479,9 +479,13 @@ def test_a_frame_outlives_its_dropped_chunk() -> None:
     assert queue.take(0)[0].frame is None
 
 
+@pytest.mark.parametrize("surface", ["sae", "sae-trace"])
 @pytest.mark.parametrize("modality", STANDARD_MODALITIES)
-def test_at_a_frame_the_live_image_is_the_one_of_reconstruct(modality: str, tiny_captures) -> None:
-    loaded, capture = weights(modality), read_capture(tiny_captures[0])
+def test_at_a_frame_the_live_image_is_the_one_of_reconstruct(
+    modality: str, surface: str, tiny_captures
+) -> None:
+    loaded, capture = weights(modality, surface=surface), read_capture(tiny_captures[0])
+    assert ("trace" in loaded.modality.layout) == (surface == "sae-trace" and modality != "frame")
     live = Engine(loaded)
     samples = capture_samples(capture, live.sampling)
     expected = reconstruct(loaded, samples.frame, samples.surface)

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from evnlos.errors import DataError
 from evnlos.events import (
+    TRACE_TAUS,
+    RunningTrace,
     TraceLaw,
     edges_from_count,
     edges_from_rate,
@@ -16,12 +18,13 @@ from evnlos.events import (
     event_histogram,
     event_trace,
     suggest_tau_us,
+    surface_with_trace,
     threshold_ordinal_surface,
     time_surface,
     voxel_grid,
 )
 from evnlos.types import Events
-from surface_reference import event_trace_reference, time_surface_reference
+from surface_reference import causal_trace_reference, event_trace_reference, time_surface_reference
 
 
 def random_events(seed: int, count: int = 300, width: int = 9, height: int = 7, span_us: int = 1000) -> Events:
@@ -249,6 +252,27 @@ def test_the_trace_is_the_smoother_of_whole_covariances(seed, law):
     assert fast.dtype == np.float32 and fast.shape == (4, 2, 2, 3)
     np.testing.assert_allclose(fast, slow, atol=3e-7)
     assert np.abs(slow).max() > 0.5
+    causal = event_trace(events, edges, 700.0, law, causal=True)
+    assert causal.dtype == np.float32 and np.abs(causal - fast).max() > 0.1
+    np.testing.assert_allclose(causal, causal_trace_reference(events, edges, 700.0, law), atol=3e-7)
+
+
+def test_the_causal_trace_knows_nothing_of_later_events():
+    """What is known at an instant stays, whatever comes later, and a stream in pieces is the stream."""
+    events, edges = random_events(1), np.array([0, 20, 50, 90])
+    whole = surface_with_trace(events, edges, 5.0)
+    assert whole.shape == (3, 4, *events.shape)
+    np.testing.assert_array_equal(whole[:, :2], time_surface(events, edges, 5.0))
+    early = events[events.t_us <= 50]
+    np.testing.assert_array_equal(surface_with_trace(early, edges[:3], 5.0), whole[:2])
+    running, done = RunningTrace(*events.shape, 5.0 * TRACE_TAUS), 0
+    for end in (7, 20, 33, 50):
+        count = int(np.searchsorted(events.t_us, end, side="right"))
+        running.add(events[done:count])
+        done = count
+    np.testing.assert_array_equal(running.at(50), whole[1, 2:])
+    with pytest.raises(DataError, match="tau_us is 0"):
+        RunningTrace(2, 3, 0.0)
 
 
 def test_the_trace_follows_a_known_light_and_doubts_noise():

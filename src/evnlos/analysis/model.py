@@ -77,13 +77,14 @@ class StreamingReconstructor:
 
         Args:
             frame: What the frame camera saw, [H, W], as in `Samples`.
-            surface: Time surface, [2, H, W].
+            surface: Time surface, [2, H, W]; [4, H, W] of `sae-trace`.
 
         Raises:
             DataError: The maps are not of the size that the network was trained on.
         """
         size = (self.sampling.height, self.sampling.width)
-        if np.shape(frame) != size or np.shape(surface) != (2, *size):
+        channels = 4 if self.sampling.surface == "sae-trace" else 2
+        if np.shape(frame) != size or np.shape(surface) != (channels, *size):
             raise DataError(
                 f"frame {np.shape(frame)} and surface {np.shape(surface)} do not fit weights for {size}; bring "
                 "them to that size by `make_samples`"

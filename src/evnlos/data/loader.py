@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.registry import Registry
 
 Maps = Mapping[str, Tensor]
-"""Recorded maps by name: "frame" [N, 1, H, W] and "surface" [N, 2, H, W] (ON, OFF), float32."""
+"""Recorded maps by name: "frame" [N, 1, H, W] and "surface" [N, 2 or 4, H, W] (ON, OFF, trace), float32."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,11 @@ class Modality:
             first += group.channels
         return found
 
+    def seeing(self, surface: str) -> Modality:
+        """Return the modality with the group `TRACE` where it has `EVENTS` and the surface is `sae-trace`."""
+        more = (TRACE,) if surface == "sae-trace" and EVENTS in self.groups else ()
+        return replace(self, groups=self.groups + more)
+
     @property
     def needs_frames(self) -> bool:
         """Whether a group is made from frames."""
@@ -132,7 +137,7 @@ class Modality:
 
         Args:
             frame: Frames, [N, H, W].
-            surface: Time surfaces, [N, 2, H, W]: ON, OFF.
+            surface: Time surfaces, [N, 2 or 4, H, W]: ON, OFF, and the trace where it is there.
 
         Raises:
             ConfigError: A group gives another number of channels than it says, or asks for an unknown map.
@@ -144,24 +149,28 @@ class Modality:
         parts = []
         for group in self.groups:
             if unknown := set(group.maps) - set(maps):
-                raise ConfigError(
-                    f"the channel group {group.name!r} asks for the map {min(unknown)!r}; recordings have "
-                    f"{', '.join(maps)}"
-                )
+                wants = f"the channel group {group.name!r} asks for the map {min(unknown)!r}"
+                raise ConfigError(f"{wants}; recordings have {', '.join(maps)}")
             part = maps[group.maps[0]] if group.make is None else group.make(maps)
             if part.ndim != 4 or part.shape[1] != group.channels:
-                raise ConfigError(
-                    f"the channel group {group.name!r} gives {tuple(part.shape)}; it says "
-                    f"[N, {group.channels}, H, W]"
-                )
+                given = f"the channel group {group.name!r} gives {tuple(part.shape)}"
+                raise ConfigError(f"{given}; it says [N, {group.channels}, H, W]")
             parts.append(part)
         return torch.cat(parts, dim=1)
 
 
 FRAME = ChannelGroup("frame", 1, ("frame",), rank_share=0.625)
 """The frame."""
-EVENTS = ChannelGroup("events", 2, ("surface",), centred=False, rank_share=0.375)
+
+
+def _pair(first: int, maps: Maps) -> Tensor:
+    return maps["surface"][:, first : first + 2]
+
+
+EVENTS = ChannelGroup("events", 2, ("surface",), partial(_pair, 0), centred=False, rank_share=0.375)
 """The two polarities of the time surface; 0 is "no event"."""
+TRACE = replace(EVENTS, name="trace", make=partial(_pair, 2))
+"""The causal trace beside the time surface, which networks of single time steps see of `sae-trace`."""
 
 MODALITIES: Registry[Modality] = Registry("evnlos.modalities", "modality")
 """Every modality by name."""
@@ -230,10 +239,8 @@ def _check_cameras(dataset: Dataset, objects: list[str], modality: Modality) -> 
     for name in objects:
         for what, recorded, other in (("frames", "frame", "event"), ("events", "surface", "frame")):
             if lacks.get(name) == what and any(recorded in group.maps for group in modality.groups):
-                raise DataError(
-                    f"{name} was recorded without {what}, and the modality is {modality.name}; give --modality "
-                    f"{other}, or leave the capture out"
-                )
+                lacking = f"{name} was recorded without {what}, and the modality is {modality.name}"
+                raise DataError(f"{lacking}; give --modality {other}, or leave the capture out")
 
 
 class NlosDataset(InMemoryDataset):
@@ -360,7 +367,7 @@ class NlosDataset(InMemoryDataset):
     def __getstate__(self) -> dict[str, Any]:
         """Return what a worker process needs: the maps stay on disk, a modality goes by its name."""
         state = {key: value for key, value in self.__dict__.items() if key not in ("inputs", "truth")}
-        if self.modality.name in MODALITIES:
+        if self.modality.name in MODALITIES and MODALITIES[self.modality.name] == self.modality:
             state["modality"] = self.modality.name
         return state
 

@@ -27,10 +27,12 @@ from evnlos.events import (
     frame_blocks,
     iter_time_surfaces,
     read_events,
+    surface_with_trace,
 )
 from evnlos.scene import LineMotion, Motion, Scene, SeveralTargets, Target
 from evnlos.types import Colour, Events, Plane
 
+_TRACES = {"trace": event_trace, "sae-trace": surface_with_trace}
 _BLOCK_BYTES = 1 << 26  # of frames and surfaces at the sensor's resolution
 
 
@@ -47,11 +49,9 @@ def frame_homography(
         dots = info.dots
         assert dots is not None
         picture = read_image(inside(folder, dots.frame))
-        if capture.frames_turned:
-            picture = picture[::-1, ::-1]
-        seen = read_events(
-            inside(folder, dots.events), width=capture.camera.width, height=capture.camera.height
-        )
+        picture = picture[::-1, ::-1] if capture.frames_turned else picture
+        width, height = capture.camera.width, capture.camera.height
+        seen = read_events(inside(folder, dots.events), width=width, height=height)
         frame = find_dots(picture, dots.rows, dots.columns)
         event = find_dots(event_histogram(seen)[0].sum(axis=0), dots.rows, dots.columns)
         how = f"{dots.rows} x {dots.columns} dots"
@@ -71,10 +71,11 @@ class Sampling:
     """Size of a pixel of the truth on the target's plane, metres."""
     scored_rows: int = 48
     """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
-    surface: Literal["sae", "context", "hots", "trace", "likelihood", "corrected"] = "sae"
-    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones; `likelihood` =
-    the target that the events of the whole sequence make most likely through the light path of `setup`;
-    `corrected` = the same of captures, less what other captures showed that the setup gets wrong of events."""
+    surface: Literal["sae", "context", "hots", "trace", "sae-trace", "likelihood", "corrected"] = "sae"
+    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones; `sae-trace` =
+    `sae` and, for networks of single time steps, the trace so far of 10 `tau_s`; `likelihood` = the target that
+    the events of the sequence make most likely through the light path of `setup`; `corrected` = the same of
+    captures, less what other captures showed that the setup gets wrong of events."""
     tau_s: float = 0.2
     """Time constant of the time surface, seconds; of `trace`, the time in which the light changes: 1 to 5."""
     radius: int = 3
@@ -126,7 +127,7 @@ class Samples:
 
     Args:
         frame: What the frame camera saw, float32 [N, H, W], 0..1 (1 = the largest digital number).
-        surface: Surface of the events, float32 [N, 2, H, W]: ON, OFF.
+        surface: Surface of the events, float32 [N, 2, H, W]: ON, OFF; 4 maps of `sae-trace`.
         truth: The target on the canvas, float32 [N, H, W], 0..1; None where the target is unknown.
         time_s: Instant of each position, float64 [N], seconds.
         position_m: Target's centre (x, y), float64 [N, 2], metres; None where the motion is unknown.
@@ -201,8 +202,8 @@ def iter_samples(
 ) -> Iterator[Samples]:
     """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
 
-    Of the surfaces `trace`, `likelihood` and `corrected` alone all are held at once. `capture` is the name of a
-    real recording, which `corrected` takes, see `event_images`.
+    Of traces, `likelihood` and `corrected` alone all are held at once. `capture` is the name of a recording,
+    which `corrected` takes, see `event_images`.
     """
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
@@ -215,8 +216,8 @@ def iter_samples(
         corrects = capture if mode == "corrected" else None
         images = event_images(events, edges_us, motion, sampling.setup, sampling.canvas, corrects)
         surfaces = frame_blocks(images, steps)
-    elif mode == "trace":
-        surfaces = frame_blocks(event_trace(events, edges_us, tau_us), steps)
+    elif mode in _TRACES:
+        surfaces = frame_blocks(_TRACES[mode](events, edges_us, tau_us), steps)
     else:
         surfaces = iter_time_surfaces(events, edges_us, tau_us, mode, radius=sampling.radius, grids=steps)
     counts = np.diff(np.searchsorted(events.t_us, edges_us, side="right")).astype(np.int64)

@@ -124,9 +124,9 @@ def read_shard(path: str | Path, steps: slice | NDArray[np.int64] | None = None)
         raise DataError(f"{path} is not a shard: it lacks a map or times; delete it and run the command again")
     truth, position_m = found["truth"], found["position_m"]
     maps = (len(time_s), *frame.shape[1:])
-    is_whole = frame.shape == maps and surface.shape == (maps[0], 2, *maps[1:]) and count.shape == time_s.shape
-    is_whole &= (truth is None or truth.shape == maps) and (position_m is None or len(position_m) == maps[0])
-    if not is_whole or (position_m is not None and position_m.shape[1:] != (2,)):
+    is_whole = frame.shape == maps == (*surface.shape[:1], *surface.shape[2:]) and count.shape == time_s.shape
+    is_whole &= (truth is None or truth.shape == maps) and surface.shape[1] in (2, 4)
+    if not is_whole or (position_m is not None and position_m.shape != (maps[0], 2)):
         what = "its maps are of different numbers or sizes"
         raise DataError(f"{path} contradicts itself: {what}; make the dataset again")
     truth = None if truth is None else truth.astype(np.float32)

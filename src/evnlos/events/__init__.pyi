@@ -1,10 +1,13 @@
 """Names of `evnlos.events`; `__init__.py` reads this list."""
 
+from .batch import TRACE_TAUS as TRACE_TAUS
+from .batch import RunningTrace as RunningTrace
 from .batch import TraceLaw as TraceLaw
 from .batch import event_batch as event_batch
 from .batch import event_trace as event_trace
 from .batch import events_from_tensors as events_from_tensors
 from .batch import events_to_tensors as events_to_tensors
+from .batch import surface_with_trace as surface_with_trace
 from .cleaning import Cleaner as Cleaner
 from .cleaning import CleanOptions as CleanOptions
 from .cleaning import CleanReport as CleanReport

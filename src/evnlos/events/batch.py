@@ -10,7 +10,8 @@ t_1 .. t_n (the pixel's events), and s_k = +1 (ON) or -1 (OFF):
 
 Both neighbours of an instant are all that it depends on, so that two walks over the events of a pixel, forward
 and back, give mean and variance of x anywhere (Rauch, Tung and Striebel, AIAA Journal 3, 1965; here with
-precisions).
+precisions). The causal trace is the walk forward alone: each event is judged once, as it comes, by what was
+expected of x_k - x_(k-1), and the mixture of signal and noise becomes the Gaussian of its mean and variance.
 
 | symbol | meaning | unit |
 |---|---|---|
@@ -179,20 +180,108 @@ def _fill(order, starts, t_us, p, begin, edges, tau, law, out):
         _read(*now, tau, law, left, right, edges, out, pixel)
 
 
+@njit(cache=True, inline="always")
+def _later(mean, variance, elapsed, tau, law):
+    """Return mean and variance of x and of its change, and their covariance, `elapsed` after the last event."""
+    phi = np.exp(-elapsed / tau)
+    walk = law.spread**2 * max(1.0 - phi * phi, 1e-9)
+    change, spread = (phi - 1.0) * mean, (phi - 1.0) ** 2 * variance + walk
+    return phi * mean, phi * phi * variance + walk, change, spread, phi * (phi - 1.0) * variance + walk
+
+
+@njit(cache=True)
+def _follow(t_us, x, y, p, tau, law, state):
+    """Bring what is known of x at each pixel's last event up to date: its mean, variance, time, 1 = had one."""
+    for k in range(len(t_us)):
+        now = state[:, y[k], x[k]]
+        mean, variance, change, spread, common = _later(now[0], now[1], t_us[k] - now[2], tau, law)
+        sign = 1.0 if p[k] else -1.0
+        aim, own = (sign, law.crossing) if now[3] else (0.5 * sign, law.quiet)
+        likely = np.exp(-0.5 * (aim - change) ** 2 / (own + spread)) / np.sqrt(own + spread)
+        other = np.exp(-0.5 * change**2 / (law.quiet + spread)) / np.sqrt(law.quiet + spread)
+        signal = (1.0 - law.noise) * likely / ((1.0 - law.noise) * likely + law.noise * other + 1e-300)
+        gain, quiet = common / (spread + own), common / (spread + law.quiet)
+        if_signal, if_noise = mean + gain * (aim - change), mean - quiet * change
+        now[0] = signal * if_signal + (1.0 - signal) * if_noise
+        now[1] = variance - (signal * gain + (1.0 - signal) * quiet) * common
+        now[1] += signal * (1.0 - signal) * (if_signal - if_noise) ** 2
+        now[2], now[3] = t_us[k], 1.0
+
+
+@njit(cache=True)
+def _present(state, t_us, tau, law, out):
+    """Write sum and difference of what is known and the mean at an instant, [2, H, W]."""
+    for row in range(state.shape[1]):
+        for column in range(state.shape[2]):
+            now = state[:, row, column]
+            mean, variance, change, spread, common = _later(now[0], now[1], t_us - now[2], tau, law)
+            quiet = common / (spread + law.quiet)  # no threshold was met since
+            mean, known = mean - quiet * change, 1.0 - (variance - quiet * common) / law.spread**2
+            out[0, row, column], out[1, row, column] = 0.5 * (known + mean), 0.5 * (known - mean)
+
+
+class RunningTrace:
+    """The trace of a stream so far: `event_trace(..., causal=True)`, at any instant from its newest event on.
+
+    The pixels begin to watch at the first event of the stream. Work grows with the events, and a map costs one
+    exponential a pixel.
+
+    Args:
+        height: Sensor height, pixels.
+        width: Sensor width, pixels.
+        tau_us: Correlation time of the light, microseconds, above 0.
+        law: What the light and the crossings are taken for; None is the default.
+
+    Raises:
+        DataError: A number is outside its range.
+    """
+
+    def __init__(self, height: int, width: int, tau_us: float, law: TraceLaw | None = None) -> None:
+        self._law, self._tau_us = law or TraceLaw(), float(tau_us)
+        _check_law(tau_us, self._law)
+        self._begin_us: int | None = None
+        self._state = np.zeros((4, height, width))
+        self._state[1] = self._law.spread**2
+
+    def add(self, events: Events) -> None:
+        """Take the next events of the stream."""
+        if not len(events):
+            return
+        if self._begin_us is None:
+            self._begin_us = int(events.t_us[0]) - 1
+        times = (events.t_us - self._begin_us).astype(np.float64)
+        _follow(times, events.x, events.y, events.p, self._tau_us, self._law, self._state)
+
+    def at(self, t_us: int) -> NDArray[np.float32]:
+        """Return the trace at an instant, float32 [2, H, W]."""
+        out = np.empty((2, *self._state.shape[1:]), np.float32)
+        since_us = 0.0 if self._begin_us is None else max(float(t_us - self._begin_us), 0.0)
+        _present(self._state, since_us, self._tau_us, self._law, out)
+        return out
+
+
+def _check_law(tau_us: float, law: TraceLaw) -> None:
+    if not (np.isfinite(tau_us) and tau_us > 0):
+        raise DataError(f"tau_us is {tau_us}; give a positive number of microseconds")
+    if not (min(law.spread, law.crossing, law.quiet) > 0 and 0 < law.noise < 1 and law.sweeps >= 0):
+        raise DataError(f"{law}: spread, crossing and quiet are positive, noise lies between 0 and 1")
+
+
 def event_trace(
-    events: Events, edges_us: ArrayLike, tau_us: float, law: TraceLaw | None = None
+    events: Events, edges_us: ArrayLike, tau_us: float, law: TraceLaw | None = None, *, causal: bool = False
 ) -> NDArray[np.float32]:
     """Return the log light of each pixel at the end of each grid, smoothed over all its events.
 
-    Unlike a time surface it looks at events before and after. What is known is 1 - variance / spread^2, 0 where
-    events tell nothing; the mean is in thresholds above the pixel's own mean. ON - OFF is the mean, ON + OFF is
-    what is known.
+    Unlike a time surface it looks at events before and after, unless it is causal. What is known is
+    1 - variance / spread^2, 0 where events tell nothing; the mean is in thresholds above the pixel's own mean.
+    ON - OFF is the mean, ON + OFF is what is known.
 
     Args:
         events: The stream; it is not changed.
         edges_us: Ascending edges, [grids + 1], microseconds; events after the last one count as well.
         tau_us: Correlation time of the light, microseconds, above 0.
         law: What the light and the crossings are taken for; None is the default.
+        causal: Whether only the events up to the end of a grid count, as of `RunningTrace`.
 
     Returns:
         float32 [grids, 2, H, W], (known + mean) / 2 and (known - mean) / 2.
@@ -208,10 +297,15 @@ def event_trace(
     """
     edges = as_edges(edges_us)
     law = law or TraceLaw()
-    if not (np.isfinite(tau_us) and tau_us > 0):
-        raise DataError(f"tau_us is {tau_us}; give a positive number of microseconds")
-    if not (min(law.spread, law.crossing, law.quiet) > 0 and 0 < law.noise < 1 and law.sweeps >= 0):
-        raise DataError(f"{law}: spread, crossing and quiet are positive, noise lies between 0 and 1")
+    _check_law(tau_us, law)
+    if causal:
+        running = RunningTrace(*events.shape, tau_us, law)
+        ends = np.searchsorted(events.t_us, edges, side="right")
+        ends[0], found = 0, np.empty((len(edges) - 1, 2, *events.shape), np.float32)
+        for grid in range(len(found)):
+            running.add(events[ends[grid] : ends[grid + 1]])
+            found[grid] = running.at(int(edges[grid + 1]))
+        return found
     pixel = events.y.astype(np.int64) * events.width + events.x
     order = np.argsort(pixel, kind="stable")
     starts = np.searchsorted(pixel[order], np.arange(events.width * events.height + 1))
@@ -220,6 +314,26 @@ def event_trace(
     times = (events.t_us - origin).astype(np.float64)
     _fill(order, starts, times, events.p, 0.0, (edges - origin).astype(np.float64), float(tau_us), law, out)
     return out.reshape(len(out), 2, events.height, events.width)
+
+
+TRACE_TAUS = 10.0
+"""Correlation time of the trace beside a surface of active events, in time constants of that surface."""
+
+
+def surface_with_trace(events: Events, edges_us: ArrayLike, tau_us: float) -> NDArray[np.float32]:
+    """Return surfaces of active events and, beside them, the causal trace of `TRACE_TAUS` times their constant.
+
+    Args:
+        events: The stream; it is not changed.
+        edges_us: Ascending edges, [grids + 1], microseconds.
+        tau_us: Time constant of the surface, microseconds, above 0.
+
+    Returns:
+        float32 [grids, 4, H, W]: ON and OFF of `time_surface`, then those of `event_trace`.
+    """
+    surface = time_surface(events, edges_us, tau_us)
+    trace = event_trace(events, edges_us, TRACE_TAUS * tau_us, causal=True)
+    return np.concatenate([surface, trace], axis=1)
 
 
 Representation = Literal["histogram", "frame", "voxel", "surface", "trace", "ordinal", "intensity"]

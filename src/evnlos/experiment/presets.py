@@ -119,6 +119,7 @@ def surface(setup: str) -> Study:
         f"{kind}, radius {r}": Sampling(surface=kind, radius=r) for kind in ("context", "hots") for r in (1, 3)
     }  # type: ignore[arg-type]
     samplings["trace, 2 s"] = Sampling(surface="trace", tau_s=2.0)
+    samplings["sae-trace"] = Sampling(surface="sae-trace")
     samplings["likelihood"] = Sampling(surface="likelihood")  # of the calibrated setup
     arms = [
         replace(arm, name=f"{arm.name} {name}", sampling=s)
@@ -212,13 +213,13 @@ def on_sequences(study: Study) -> Study:
     epochs, as many as bring the validation to rest, and so does fine-tuning.
 
     Args:
-        study: Any study; its arms on sequences stay as they are.
+        study: Any study; arms on sequences stay as they are, and those of `sae-trace`, not seen, are left out.
 
     Raises:
         ConfigError: An arm has no linear embedding that could be pooled.
     """
     arms = []
-    for arm in study.arms:
+    for arm in (one for one in study.arms if one.sampling.surface != "sae-trace"):
         pre, fine = arm.pretraining, arm.finetuning
         if pre is not None:
             pre = _of_sequences(pre, 6, arm.name)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from evnlos.analysis.model import StreamingReconstructor
 from evnlos.errors import ConfigError, DataError
+from evnlos.events import TRACE_TAUS, RunningTrace
 from evnlos.events import surface as kernels
 from evnlos.live.packet import UNKNOWN_US, Chunk, Clock, SystemClock
 from evnlos.models import Weights
@@ -193,7 +194,7 @@ class Picture:
         t_us: Event time that it shows, microseconds.
         made_s: Instant at which it was ready, seconds on the `Clock`.
         image: The reconstruction, float32 [H, W], 0..1.
-        surface: The time surface that the network saw, float32 [2, H, W]: ON, OFF.
+        surface: The time surface that the network saw, float32 [2, H, W]: ON, OFF; 4 maps of `sae-trace`.
         frame: The frame that it saw, float32 [H, W], 0..1; None without frames.
         events: Number of events that are new in it.
         timing: How long it took.
@@ -220,7 +221,7 @@ class Engine:
         clock: The clock that it goes by.
 
     Raises:
-        ConfigError: The weights were trained on another surface than "sae".
+        ConfigError: The weights were trained on another surface than "sae" and "sae-trace".
 
     Example:
         >>> from evnlos.data import Sampling
@@ -237,10 +238,10 @@ class Engine:
     def __init__(self, weights: Weights, clock: Clock | None = None) -> None:
         self._see = StreamingReconstructor(weights)
         self.modality, self.sampling = weights.modality, self._see.sampling
-        if self.sampling.surface != "sae":
+        if self.sampling.surface not in ("sae", "sae-trace"):
             raise ConfigError(
-                f"the weights take the surface {self.sampling.surface!r}; live reconstruction makes 'sae': "
-                "train with --sampling.surface sae"
+                f"the weights take the surface {self.sampling.surface!r}; live reconstruction makes 'sae' and "
+                "'sae-trace': train with --sampling.surface sae"
             )
         self._clock = clock or SystemClock()
         self._shape = self.sampling.height, self.sampling.width
@@ -255,6 +256,7 @@ class Engine:
 
     def _forget(self) -> None:
         self._surface: RunningSurface | None = None
+        self._trace: RunningTrace | None = None
         self._frame: NDArray[np.float32] | None = None
         self._until_us = UNKNOWN_US
         self._events = 0
@@ -262,11 +264,20 @@ class Engine:
     def begin(self) -> None:
         """Forget what came before, and compile now what would make the first image late."""
         self._forget()
-        surface, reduce = RunningSurface(*self._shape, 1.0), AreaReduction(self._shape, self._shape)
         place = np.zeros(1, np.uint16)
-        surface.add(Events(np.array([1]), place, place, np.array([True]), self._shape[1], self._shape[0]))
+        one = Events(np.array([1]), place, place, np.array([True]), self._shape[1], self._shape[0])
+        self._take(Chunk(one, 1, 0.0, 0.0))
         for _ in range(_WARM):
-            self._see(self._dark, reduce(surface.at(1)))
+            self._see(self._dark, self._maps())
+        self._forget()
+
+    def _maps(self) -> NDArray[np.float32]:
+        """Return the surface at the instant that the stream has reached, as the network sees it."""
+        assert self._surface is not None
+        found = self._surface.at(self._until_us)
+        if self._trace is not None:
+            found = np.concatenate([found, self._trace.at(self._until_us)])
+        return self._reduce(found)
 
     def see(self, chunks: Sequence[Chunk]) -> Picture | None:
         """Take chunks in their order and return the image behind them; None where there is none to be made.
@@ -292,7 +303,7 @@ class Engine:
             return None
         if not self.modality.needs_events and not new_frame:
             return None
-        surface = self._reduce(self._surface.at(self._until_us))
+        surface = self._maps()
         mapped_s = self._clock.now()
         image = self._see(self._dark if self._frame is None else self._frame, surface).numpy()
         made_s = self._clock.now()
@@ -309,7 +320,11 @@ class Engine:
         if self._surface is None:
             self._surface = RunningSurface(*chunk.events.shape, self.sampling.tau_s * 1e6)
             self._reduce = AreaReduction(chunk.events.shape, self._shape)
+            if self.sampling.surface == "sae-trace":
+                self._trace = RunningTrace(*chunk.events.shape, TRACE_TAUS * self.sampling.tau_s * 1e6)
         self._surface.add(chunk.events)
+        if self._trace is not None:
+            self._trace.add(chunk.events)
         self._events += len(chunk.events)
         if chunk.frame is not None:
             image = np.ascontiguousarray(chunk.frame, np.float32)

@@ -74,7 +74,7 @@ class UNetConfig(ReconstructorSettings):
 
     def build(self, modality: str | Modality, sampling: Sampling) -> Reconstructor:
         """Return a reconstructor of single time steps with random weights."""
-        return UNetReconstructor(as_modality(modality), self, sampling)
+        return UNetReconstructor(as_modality(modality).seeing(sampling.surface), self, sampling)
 
 
 class ResidualBlock(nn.Module):

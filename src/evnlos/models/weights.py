@@ -355,12 +355,12 @@ def _network(about: dict[str, Any], tensors: dict[str, torch.Tensor], path: Path
             f"{path} names the modality {str(modality)[:40]!r}; give one of {', '.join(MODALITIES)}"
         )
     seen = MODALITIES[modality]
-    if about.get("channels", seen.layout) != seen.layout:
+    made_for: Sampling = from_dict(Sampling, sampling, source=f"{path}: sampling")  # type: ignore[arg-type]
+    if about.get("channels", seen.layout) not in (seen.layout, seen.seeing(made_for.surface).layout):
         raise DataError(
             f"{path} sees the channels {str(about['channels'])[:80]}; the modality {modality!r} has "
             f"{seen.layout}: register the modality that it was trained with"
         )
-    made_for: Sampling = from_dict(Sampling, sampling, source=f"{path}: sampling")  # type: ignore[arg-type]
     # Weights that were handed on bring their setup along, which comes before the folder that it once was.
     if made_for.setup and (beside := _setup_beside(path)):
         made_for = replace(made_for, setup=str(beside))

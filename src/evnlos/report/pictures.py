@@ -106,8 +106,8 @@ def stretched(image: ArrayLike) -> NDArray[np.uint8]:
 
 
 def polarity(surface: ArrayLike) -> NDArray[np.uint8]:
-    """Return a surface [2, H, W] (ON, OFF) as 8-bit RGB [H, W, 3]: ON orange, OFF blue, nothing white."""
-    maps = np.asarray(surface, dtype=np.float64)
+    """Return ON and OFF, the first of maps [2 or 4, H, W], as 8-bit RGB [H, W, 3]: orange, blue, on white."""
+    maps = np.asarray(surface, dtype=np.float64)[:2]
     on, off = np.clip(maps / max(float(maps.max()), 1e-12), 0, 1)
     picture = 255 - on[..., None] * (255 - np.array(ON_RGB)) - off[..., None] * (255 - np.array(OFF_RGB))
     return np.clip(picture, 0, 255).astype(np.uint8)
