@@ -28,9 +28,9 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
-from evnlos.optics.radiometric import STRICT
 
 Array = NDArray[np.float64]
+STRICT = {"nnan", "ninf", "nsz", "contract"}  # sums in their order: compiled or cached, a kernel gives the same
 
 _KINDS = ("ggx", "beckmann", "streak", "ring")
 _RING_WIDTH = 0.3  # standard deviation of a ring's radius, in radii
