@@ -324,11 +324,24 @@ def test_an_ensemble_is_the_mean_of_its_images(records) -> None:
 
 def test_validation_leaves_the_test_characters_unread(apart) -> None:
     study = replace(STUDY, name="choose", arms=ARMS[:1], seeds=(0,), validation=("L",))
+    (apart.out / "setups" / "lab").rename(apart.out / "setups" / "lab-without-L")
     found = run_study(study, apart)
     assert [r.split for r in found] == ["validation"]
     recorded = open_dataset(apart.out / "recorded" / found[0].settings["captures"])
     assert sorted(recorded.objects()) == ["lab_A", "lab_L", "lab_T"]
     assert recorded.objects("validation") == ["lab_L"]
+
+
+def test_what_is_validated_on_was_not_calibrated_with(apart, monkeypatch) -> None:
+    """Pre-training draws the known targets of the calibration again: it must not know those that are scored."""
+
+    def fit(captures, settings, progress):
+        raise DataError(" ".join(settings.exclude))
+
+    monkeypatch.setattr("evnlos.experiment.run.fit_setup", fit)
+    study = replace(STUDY, arms=ARMS[1:2], seeds=(0,), validation=("L",))
+    with pytest.raises(CalibrationError, match=r"^4 L$"):
+        run_study(study, apart)
 
 
 def test_few_captures_are_nested_and_keep_the_test(apart) -> None:

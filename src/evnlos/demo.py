@@ -171,7 +171,7 @@ def run_demo(settings: Demo) -> Path:
         ) from None
     records = read_records(out / "records" / study.name)
     if settings.calibrate:
-        notes += _of_calibration(out / "setups" / study.setup)
+        notes += _of_calibration(study.setup_folder(out))
     else:
         notes.append("The simulator was not fitted to this setup.")
 
@@ -181,7 +181,7 @@ def run_demo(settings: Demo) -> Path:
     recorded = [out / "recorded" / record.settings["captures"] for record in single]  # E2E sees other surfaces
     with ProgressBars() as progress:
         dataset, results = collect_results(runs, recorded, workers=settings.workers, progress=progress)
-    setup = named_setup(out / "setups" / study.setup) if settings.calibrate else None
+    setup = named_setup(study.setup_folder(out)) if settings.calibrate else None
     path = write_report(out / "report.html", dataset, results, notes, setup=setup)
     for note in notes:
         print(note)

@@ -165,7 +165,7 @@ class ExperimentCommand:
         records = experiment.merge_folds(records, self.captures_of) if self.folds else records
         records = [r for r in records if r.setup == self.captures_of and r.split == study.split]
         text = _tables(name, records, self.metric)
-        text += experiment.bounds_table(self.out / "setups" / studies[0].setup, folders[0], self.captures_of)
+        text += experiment.bounds_table(studies[0].setup_folder(self.out), folders[0], self.captures_of)
         name = f"{name}-{self.captures_of}-{study.split}"
         self._tell(name, text, lambda image: draw_scores(records, self.metric, image))
 

@@ -120,16 +120,16 @@ def run_studies(studies: Sequence[Study], place: Place, progress: Progress = sil
 
 def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
     """Calibrate, simulate and import what a study lacks, and return its networks, which are not trained."""
-    setup = place.out / "setups" / study.setup
+    setup = study.setup_folder(place.out)
     needs_setup = study.correct_pattern or any(arm.needs_setup for arm in study.arms)
     sees_events = any(as_modality(name).needs_events for name in study.modalities)
     arms = tuple(arm.with_light_path(setup, sees_events=sees_events) for arm in study.arms)
     if needs_setup and not calibrated_file(setup).is_file():
-        settings = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test))
-        progress(Step(f"calibrate {study.setup}", 0, 1, "setups"))
+        how = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test, *study.validation))
+        progress(Step(f"calibrate {setup.name}", 0, 1, "setups"))
         try:
-            fit = fit_setup(place.captures, settings, progress)
-            write_setup(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), setup)
+            fit = fit_setup(place.captures, how, progress)
+            write_setup(fit, rows_of(fit, how.start.pixel, how.start.frame_camera), setup)
             _draw(fit, setup / "check.png")
             if sees_events and any(arm.sampling.is_solved for arm in arms):
                 from evnlos.calibration import write_event_errors  # which takes a help text longer to show
@@ -276,7 +276,7 @@ def captures_of(root: Path, setup: str) -> list[Path]:
 def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     """Return the simulation that an arm is pre-trained on."""
     if arm.source == "calibrated":
-        config = load_yaml(Simulation, place.out / "setups" / study.setup / "training.yaml")
+        config = load_yaml(Simulation, study.setup_folder(place.out) / "training.yaml")
         config = replace(config, setups=config.setups if study.setups is None else study.setups)
     else:
         config = study.simulation or default()
@@ -306,7 +306,7 @@ def _chosen(study: Study, arm: Arm, place: Place) -> list[Path]:
 def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset:
     held = study.test if not study.validation else ()
     chosen = _chosen(study, arm, place)
-    pattern = load_pattern(place.out / "setups" / study.setup) if study.correct_pattern else None
+    pattern = load_pattern(study.setup_folder(place.out)) if study.correct_pattern else None
     seen: dict[str, Any] = {"captures": [f.name for f in chosen], "sampling": to_dict(arm.sampling)}
     seen |= {"test": list(held), "validation": list(study.validation), "pattern": pattern and pattern.digest}
     out = place.out / "recorded" / f"{study.setup}-{config_hash(seen)[:8]}"

@@ -156,7 +156,7 @@ class Study:
     simulation: Simulation | None = None
     """What an uncalibrated arm is pre-trained on; None is the default simulation."""
     calibration: Calibration = field(default_factory=Calibration)
-    """How the setup is calibrated; the test characters are left out of it whatever it says."""
+    """How the setup is calibrated; whatever it says, characters that are scored are left out of it."""
     setups: int | None = None
     """Different walls and cameras in the calibrated simulation; None is as many as the calibration says."""
     robust: bool = False
@@ -164,8 +164,7 @@ class Study:
     refine: bool = True
     """Also score images after data consistency, where there are a frame and a calibrated setup."""
     average: bool = False
-    """Also score the images of networks of single positions after they are aligned along the known motion and
-    averaged over the sequence."""
+    """Also score images of single positions, aligned along the known motion and averaged over the sequence."""
     retrieval: bool = False
     """Also score the simulated object that explains the frames of a sequence best."""
     correct_pattern: bool = True
@@ -174,16 +173,13 @@ class Study:
     def __post_init__(self) -> None:
         if not self.arms or not self.modalities or not self.seeds:
             raise ConfigError(f"the study {self.name!r} has no arm, no modality or no seed")
-        names = [arm.name for arm in self.arms]
-        if len(set(names)) != len(names):
+        if len(set(names := [arm.name for arm in self.arms])) != len(names):
             raise ConfigError(f"the study {self.name!r} has two arms of one name among {', '.join(names)}")
         if set(self.test) & set(self.validation):
             raise ConfigError("a character is for testing or for validation, not for both")
 
     def begun_with(self, start: str) -> Study:
-        """Return the study with pre-trainings that begin with installed layers, where any are like the network.
-
-        Such a network becomes as wide as the layers, and learns in smaller steps.
+        """Return the study whose pre-trainings begin with installed layers, as wide as these, in smaller steps.
 
         Args:
             start: First part of the names of the weights: "generic".
@@ -203,15 +199,18 @@ class Study:
                 arm = replace(arm, pretraining=changed)
             arms.append(arm if names else own)
         if arms == list(self.arms):
-            raise ConfigError(
-                f"no network of {self.name} begins with the layers {start!r}; those of sequence do"
-            )
+            raise ConfigError(f"no network of {self.name} begins with layers {start!r}; those of sequence do")
         return replace(self, arms=tuple(arms))
 
     @property
     def split(self) -> str:
         """The split that is scored."""
         return "validation" if self.validation else "test"
+
+    def setup_folder(self, out: Path) -> Path:
+        """Return the folder of the calibrated setup, which has not seen what is scored."""
+        without = f"-without-{''.join(self.validation)}" if self.validation else ""
+        return out / "setups" / f"{self.setup}{without}"
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,7 @@ def _without_network(
     if arm.finetuning is not None or made is None:
         return
     if study.retrieval and modality == "frame" and arm.source == "calibrated":
-        setup = place.out / "setups" / study.setup
+        setup = study.setup_folder(place.out)
         yield (
             "retrieval",
             lambda: retrieved(
@@ -212,7 +212,7 @@ def _explained(back: Tensor, gram: Tensor, targets: Tensor) -> Tensor:
 
 def _consistent(study: Study, arm: Arm, recorded: Dataset, place: Place, images: Tensor) -> Tensor:
     """Return images of the scored split after data consistency with the calibrated setup."""
-    operator = _operator(place.out / "setups" / study.setup, arm.sampling)
+    operator = _operator(study.setup_folder(place.out), arm.sampling)
     names = recorded.objects(study.split)
     frames = torch.cat([torch.from_numpy(read_shard(recorded.shard(name))[0].frame) for name in names])
     return consistent(images, frames, operator, TRUST)
