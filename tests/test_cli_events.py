@@ -516,7 +516,7 @@ def test_what_a_damaged_array_lacks_is_named(tmp_path: Path, capsys, monkeypatch
     np.save("cut.npy", np.zeros((9, 40, 60), np.uint8))
     Path("cut.npy").write_bytes(Path("cut.npy").read_bytes()[:4000])
     said = fails(capsys, "events", "cut.npy", "--fps", 5, "--out", "e.h5")
-    assert "cut.npy: no array of numbers (mmap length is greater than file size)" in said
+    assert "cut.npy: not a NumPy array of numbers, or cut short; save one" in said
     np.savez("float.npz", t=np.array([0.1, np.nan]), x=[1, 2], y=[1, 2], p=[1, 0])
     said = fails(capsys, "convert", "float.npz", "--out", "e.h5")
     assert "array t has dtype float64; give whole numbers, times in microseconds" in said

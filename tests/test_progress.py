@@ -221,7 +221,8 @@ def test_networks_at_work_are_told_with_their_epochs(tmp_path) -> None:
     assert text == "half epoch 3/4, new epoch 1/4"
 
 
-def test_invert_tells_its_captures_and_its_solvers(tiny_captures, tmp_path, capsys) -> None:
+def test_invert_tells_its_captures_and_its_solvers(tiny_captures, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("evnlos.machine.LINE_S", 1e-6)  # every step is told, however fast it is
     words = [
         "invert",
         str(tiny_captures[0]),
@@ -234,7 +235,7 @@ def test_invert_tells_its_captures_and_its_solvers(tiny_captures, tmp_path, caps
         "--force",
     ]
     for more, told in (
-        (["--positions", "2"], "invert: 0 of 1 motions (light path of the setup)"),
+        (["--positions", "2"], "invert: 0 of 1 motions (light path of the setup"),
         (["--from", "frames"], "invert: 0 of 1"),
     ):
         main([*words, *more, "--progress", "lines", "--out", str(tmp_path / "i.png")])
@@ -281,6 +282,7 @@ def test_a_light_path_counts_what_is_done(name: str, monkeypatch) -> None:
     """It stood there as "light path" for as long as it took."""
     noted = list[str]()
     monkeypatch.setattr("evnlos.optics.radiometric.note", noted.append)
+    monkeypatch.setattr("evnlos.optics.radiometric._FEWEST", 64)
     dense = load_setup(name).operator(Plane(6, 6, 0.013), (25, 40)).dense()
     assert (
         len(noted) >= 15

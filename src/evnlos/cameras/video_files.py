@@ -343,8 +343,9 @@ class ArraySource:
                 self._array = np.load(path, mmap_mode="r", allow_pickle=False)
             if not isinstance(self._array, np.ndarray):
                 raise ValueError("an archive of arrays")
-        except NUMPY_ERRORS as error:
-            raise DataError(f"{path}: no array of numbers ({error}); save one with numpy.save") from None
+        except NUMPY_ERRORS:
+            found = "not a NumPy array of numbers, or cut short"
+            raise DataError(f"{path}: {found}; save one with numpy.save, or copy it again") from None
         shape, dtype = self._array.shape, self._array.dtype
         if len(shape) not in (3, 4) or (len(shape) == 4 and shape[3] != 3) or 0 in shape[1:]:
             raise DataError(f"{path}: an array of shape {shape}; give [T, H, W] or [T, H, W, 3]")
