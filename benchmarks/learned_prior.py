@@ -1,6 +1,6 @@
 """What a learned prior adds to a Gaussian one, and whether its intervals hold, on targets that neither knows.
 
-    python benchmarks/learned_prior.py packages/evnlos-weights/src/evnlos_weights/near.yaml
+    python benchmarks/learned_prior.py [SETUP] [--each 12]
 
 The light path is that of a setup, whose frames of one sequence say A and b of a target's coefficients; b is
 drawn exactly as the frames' noise has it, at the light of the setup and at less. Targets are letters by hands
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -76,7 +77,8 @@ def row_of(
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("setup", help="a setup, as of `evnlos invert`")
+    near = Path(__file__).parent.parent / "packages/evnlos-weights/src/evnlos_weights/near.yaml"
+    parser.add_argument("setup", nargs="?", default=str(near), help="a setup, as of `evnlos invert`")
     parser.add_argument("--prior", default="targets", help="name or file of the learned prior")
     parser.add_argument("--each", type=int, default=12, help="targets of each kind")
     options = parser.parse_args()
