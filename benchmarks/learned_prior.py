@@ -24,6 +24,7 @@ from evnlos.inverse.event_images import CELLS, event_prior
 from evnlos.inverse.prior import PatternPrior
 from evnlos.metrics import psnr
 from evnlos.models import TargetLikelihood, load_prior, posterior_samples
+from evnlos.models.posterior import OPEN, interval_of
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, LineMotion
 from evnlos.scene.glyph_sets import DrawingGlyphs
 from evnlos.setups import load_setup
@@ -31,9 +32,7 @@ from evnlos.types import Plane
 
 SHAPE = (100, 160)
 LIGHT = (1.0, 0.1, 0.01)
-NEAR = 0.02  # an interval is widened by it: what is dark for sure is no interval of width 0
 SIDE_M, SPAN_S, FRAMES = 0.08, (0.0, 8.0), 40
-PATTERNS = 240
 
 
 def information_of(setup_name: str, basis: PatternPrior) -> np.ndarray:
@@ -60,10 +59,9 @@ def row_of(
         seen = torch.from_numpy(truth).float()
         images = torch.from_numpy(basis.image(z)).float().clamp(0, 1), samples.mean(dim=0), samples[0]
         found.append([float(psnr(one[None], seen[None])) for one in images])
-        low, high = samples.quantile(0.05, dim=0) - NEAR, samples.quantile(0.95, dim=0) + NEAR
-        inside = (seen >= low) & (seen <= high)
-        is_open = high - low > 0.2
-        held.append(float(inside.float().mean()))
+        low, high = interval_of(samples.double().numpy())
+        inside, is_open = (truth >= low) & (truth <= high), high - low > OPEN
+        held.append(float(inside.mean()))
         open_cells.append((int((inside & is_open).sum()), int(is_open.sum())))
     mean = np.mean(found, axis=0)
     inside, total = np.sum(open_cells, axis=0)
@@ -83,7 +81,7 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=12, help="targets of each kind")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    basis = event_prior(load_setup(options.setup), SIDE_M, PATTERNS)
+    basis = event_prior(load_setup(options.setup), SIDE_M)
     hands = HandwritingGlyphs(characters="HSU5", writers=options.each, first_writer=TRAIN_WRITERS)
     sets = {"letters": hands, "drawings": DrawingGlyphs(each=-(-options.each // 6), first=0)}
     information = information_of(options.setup, basis)

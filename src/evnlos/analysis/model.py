@@ -83,8 +83,7 @@ class StreamingReconstructor:
             DataError: The maps are not of the size that the network was trained on.
         """
         size = (self.sampling.height, self.sampling.width)
-        channels = 4 if self.sampling.surface == "sae-trace" else 2
-        if np.shape(frame) != size or np.shape(surface) != (channels, *size):
+        if np.shape(frame) != size or np.shape(surface) != (self.sampling.surface_maps, *size):
             raise DataError(
                 f"frame {np.shape(frame)} and surface {np.shape(surface)} do not fit weights for {size}; bring "
                 "them to that size by `make_samples`"

@@ -18,7 +18,7 @@ from evnlos.cameras import FrameCamera
 from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import FrameTerm, SequenceLight, handwritten_prior, sequence_light
+from evnlos.inverse import FrameTerm, SequenceLights, handwritten_prior
 from evnlos.scene import Ink
 from evnlos.setups import Setup
 from evnlos.types import Plane
@@ -381,14 +381,11 @@ def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
     together = held.shape[0] * held.shape[1] / (grid[0] * grid[1])  # pixels whose mean is one of the grid
     plane = Plane(_CELLS, _CELLS, held.target_size_m / _CELLS)
     prior = handwritten_prior(plane, ink=Ink.of(scene.target for scene in held.scenes))
-    errors, lights = np.zeros(len(FACTORS)), dict[Any, SequenceLight]()
+    errors, lights = np.zeros(len(FACTORS)), SequenceLights()
     for k, (capture, scene) in enumerate(zip(held.captures, held.scenes, strict=True)):
         times_s = held.times_s(k)
         span_s = (float(times_s[0]), float(times_s[-1]))
-        key = (scene.motion, span_s)
-        if key not in lights:
-            lights[key] = sequence_light(setup, prior, scene.motion.position_m, span_s, grid)
-        light = lights[key]
+        light = lights.of(setup, prior, scene.motion, span_s, grid)
         frames = noise.pattern.correct(capture.frames, held.peak)
         values = np.asarray(reduce_by_area(frames, grid), np.float64).reshape(len(frames), -1)
         told = FrameTerm(light, values, times_s, noise.camera, known_pattern=True).normal

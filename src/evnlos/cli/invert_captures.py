@@ -26,6 +26,7 @@ from evnlos.data import Capture, load_pattern, pattern_of, read_capture
 from evnlos.data.fixed_pattern import object_light
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
+    SequenceLights,
     SequenceOperator,
     SequenceProblem,
     unexplained,
@@ -271,7 +272,7 @@ def estimate_captures(
     word: Path,
     evidence: Literal["frames", "events", "both"],
     pattern: Path | None,
-    learned: int = 0,
+    samples: int = 0,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and of each capture the target [cells, cells] and its standard deviation, by name.
@@ -281,19 +282,19 @@ def estimate_captures(
         word: Their setup.
         evidence: What the likelihood is made of.
         pattern: Fixed pattern of the frame camera; without it an offset of each pixel is integrated out.
-        learned: Samples under the learned prior; 0: the Gaussian prior, without any.
+        samples: Samples under the learned prior; 0: the Gaussian prior, without any.
         progress: Called as each capture is done.
 
     Raises:
         ConfigError: The setup is not linear, its event model states no law, or a motion is unknown.
     """
-    setup, prior = linear_setup(word), load_prior() if learned else None
+    setup, prior = linear_setup(word), load_prior() if samples else None
     known = None if pattern is None else load_pattern(pattern)
-    lights: dict[Any, Any] = {}
+    lights = SequenceLights()
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
         capture = read_capture(folder, needs_frames=evidence != "events", needs_events=evidence != "frames")
-        found = estimate_target(capture, setup, evidence, known, prior, learned, lights)
+        found = estimate_target(capture, setup, evidence, known, prior, samples, lights)
         rows.append(_row(capture, found))
         pictures[capture.name] = torch.from_numpy(found.image)
         pictures[f"{capture.name} deviation"] = torch.from_numpy(found.deviation)

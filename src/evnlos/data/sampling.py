@@ -96,6 +96,11 @@ class Sampling:
         check_made(self)
 
     @property
+    def surface_maps(self) -> int:
+        """Maps of the surface: ON and OFF, and those of the trace where it stands beside them."""
+        return 4 if self.surface == "sae-trace" else 2
+
+    @property
     def is_solved(self) -> bool:
         """Whether the surface is the target that the events show through the light path of `setup`."""
         return self.surface in ("likelihood", "corrected")

@@ -50,6 +50,7 @@ from .problem import block_folds as block_folds
 from .sequence_light import FrameTerm as FrameTerm
 from .sequence_light import NormalEquations as NormalEquations
 from .sequence_light import SequenceLight as SequenceLight
+from .sequence_light import SequenceLights as SequenceLights
 from .sequence_light import sequence_light as sequence_light
 from .sequence_problem import SequenceOperator as SequenceOperator
 from .sequence_problem import SequenceProblem as SequenceProblem

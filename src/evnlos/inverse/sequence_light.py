@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,6 +22,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import PatternPrior
 from evnlos.inverse.sequence_problem import SequenceOperator, strip_of
 from evnlos.optics import MatrixTransport
+from evnlos.scene import Motion
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -140,6 +141,27 @@ class SequenceLight:
     def _single(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """The factors in single precision, the mean target left out: what many rows are made of."""
         return self.left.astype(np.float32), np.ascontiguousarray(self.right[:, :, 1:], np.float32)
+
+
+class SequenceLights:
+    """Lights of the sequences of one setup, each made once: captures of one motion share theirs."""
+
+    def __init__(self) -> None:
+        self._made = dict[Hashable, SequenceLight]()
+
+    def of(
+        self,
+        setup: Setup,
+        prior: PatternPrior,
+        motion: Motion,
+        span_s: tuple[float, float],
+        shape: tuple[int, int],
+    ) -> SequenceLight:
+        """Return the light of a motion, for the coefficients of a prior; as `sequence_light`."""
+        key = (motion, span_s, shape, prior.target_plane, prior.count)
+        if key not in self._made:
+            self._made[key] = sequence_light(setup, prior, motion.position_m, span_s, shape)
+        return self._made[key]
 
 
 def sequence_light(

@@ -28,12 +28,13 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from evnlos.data import Capture, FixedPattern
 from evnlos.errors import ConfigError, UnknownNameError
@@ -41,12 +42,11 @@ from evnlos.inverse import (
     FrameTerm,
     PatternPrior,
     SequenceEstimate,
+    SequenceLights,
     estimate_sequence,
     record_of,
-    sequence_light,
 )
 from evnlos.inverse.event_images import COEFFICIENTS, event_prior
-from evnlos.inverse.sequence_light import SequenceLight
 from evnlos.machine import note
 from evnlos.models.unet import ResidualUNet, UNetConfig
 from evnlos.models.weights import weights_folders
@@ -65,7 +65,8 @@ _PATTERNS = 120  # of a target: all that a minute of a core allows where events 
 _GAP_S = 0.4  # between the instants at which silences are looked at
 _NORMAL_90 = 1.645
 _BESIDE = 0.02  # an interval of samples is widened by it: what is dark for sure is no interval of width 0
-_OPEN = 0.2
+OPEN = 0.2
+"""Width of an interval, brightness, from which a cell counts as left open."""
 
 
 @dataclass(frozen=True)
@@ -142,16 +143,11 @@ class LearnedPrior(nn.Module):
 
 
 def _built(about: AboutPrior, **tensors: Tensor) -> LearnedPrior:
-    prior = LearnedPrior(about)
-    flat, place = tensors["weights"].float(), 0
-    for value in prior.parameters():
-        if (end := place + value.numel()) > flat.numel():
-            break
-        value.data.copy_(flat[place:end].view_as(value))
-        place = end
+    prior, numbers = LearnedPrior(about), tensors["weights"].float()
     count = sum(value.numel() for value in prior.parameters())
-    if flat.numel() != count:
-        raise ValueError(f"{flat.numel()} numbers for a network of {count}")
+    if numbers.numel() != count:
+        raise ValueError(f"{numbers.numel()} numbers for a network of {count}")
+    vector_to_parameters(numbers, prior.parameters())
     return prior.eval()
 
 
@@ -168,8 +164,7 @@ def save_prior(path: str | Path, prior: LearnedPrior) -> None:
         path: The file, NAME.safetensors.
         prior: What is written.
     """
-    numbers = torch.cat([value.detach().flatten() for value in prior.parameters()])
-    PRIOR.write(path, {"weights": numbers.half()}, prior.about)
+    PRIOR.write(path, {"weights": parameters_to_vector(prior.parameters()).detach().half()}, prior.about)
 
 
 def load_prior(word: str | Path = "targets") -> LearnedPrior:
@@ -264,6 +259,12 @@ def posterior_samples(
     return image.clamp(0, 1)
 
 
+def interval_of(samples: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the ends of the 90 % interval of each cell of samples [S, h, w], two of [h, w]."""
+    low, high = (np.quantile(samples, part, axis=0) for part in (0.05, 0.95))
+    return low - _BESIDE, high + _BESIDE
+
+
 @dataclass(frozen=True, eq=False)
 class TargetEstimate:
     """A target with its uncertainty.
@@ -293,7 +294,7 @@ class TargetEstimate:
     @property
     def open_share(self) -> float:
         """Share of the cells whose interval is wider than a fifth of white: what stands there is a guess."""
-        return float((self.high - self.low > _OPEN).mean())
+        return float((self.high - self.low > OPEN).mean())
 
 
 def estimate_target(
@@ -303,7 +304,7 @@ def estimate_target(
     pattern: FixedPattern | None = None,
     prior: LearnedPrior | None = None,
     samples: int = 32,
-    lights: dict[Any, SequenceLight] | None = None,
+    lights: SequenceLights | None = None,
 ) -> TargetEstimate:
     """Return the target of a capture whose motion is known, from the one likelihood of its whole sequence.
 
@@ -314,7 +315,7 @@ def estimate_target(
         pattern: Fixed pattern of the frame camera; None: an offset of each pixel is integrated out.
         prior: A learned prior; None: the Gaussian of handwriting.
         samples: Samples under a learned prior.
-        lights: Light of captures of one setup and motion, kept from call to call.
+        lights: Lights of the setup's sequences, kept from call to call.
 
     Raises:
         ConfigError: The motion is unknown, or the event model states no law of its crossings.
@@ -325,10 +326,8 @@ def estimate_target(
     basis = event_prior(setup, size, _PATTERNS if prior is None or evidence != "frames" else COEFFICIENTS)
     times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
     span, shape = (float(times[0]), float(times[-1])), (capture.events.height, capture.events.width)
-    lights, key = {} if lights is None else lights, (motion, span, shape, size, basis.count)
-    if key not in lights:
-        lights[key] = sequence_light(setup.seen_by(shape), basis, motion.position_m, span, shape)
-    light, frames, record, law, begun = lights[key], None, None, None, time.process_time()
+    light = (lights or SequenceLights()).of(setup.seen_by(shape), basis, motion, span, shape)
+    frames, record, law, begun = None, None, None, time.process_time()
     if evidence != "events":
         peak = float(capture.peak)
         levels = capture.frames / peak if pattern is None else pattern.correct(capture.frames, peak)
@@ -350,7 +349,6 @@ def estimate_target(
         each = drawn.double().numpy()
         image, deviation = each.mean(axis=0), each.std(axis=0, ddof=min(samples - 1, 1))
         error = float(np.square(deviation).mean())
-        low, high = (np.quantile(each, part, axis=0) for part in (0.05, 0.95))
-        low, high = low - _BESIDE, high + _BESIDE
+        low, high = interval_of(each)
     seconds = round(time.process_time() - begun, 1)
     return TargetEstimate(basis.target_plane, image, deviation, low, high, error, seconds, found, drawn)

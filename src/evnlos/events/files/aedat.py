@@ -85,6 +85,12 @@ def read_comments(file: BinaryIO) -> list[str]:
     return lines
 
 
+def _opened(path: Path) -> tuple[list[str], int, int]:
+    """Return the header's lines, the byte behind them, and the size of the file."""
+    with open_regular(path) as file:
+        return read_comments(file), file.tell(), file.seek(0, 2)
+
+
 def set_size(report: ReadReport, chip: str, width: int | None, height: int | None) -> None:
     """Put the sensor size into the report: the caller's, else that of the camera that the header names.
 
@@ -147,10 +153,7 @@ class Aedat2Source:
     def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
         self.path, self.report = path, report
         report.format = "AEDAT2"
-        with open_regular(path) as file:
-            lines = read_comments(file)
-            self._start = file.tell()
-            self._size = file.seek(0, 2)
+        lines, self._start, _ = _opened(path)
         if not lines or not lines[0].startswith("#!AER-DAT2"):
             raise unreadable(path, 0, "an AEDAT file whose first line is damaged", "#!AER-DAT2.0 belongs there")
         chip = next((line.partition("AEChip:")[2].strip() for line in lines if "AEChip:" in line), "")
@@ -295,10 +298,7 @@ class Aedat3Source:
     ) -> None:
         self.path, self.report = path, report
         report.format = "AEDAT3"
-        with open_regular(path) as file:
-            lines = read_comments(file)
-            self._start = file.tell()
-            self._size = file.seek(0, 2)
+        lines, self._start, self._size = _opened(path)
         if not lines or lines[0].strip() != "#!AER-DAT3.1":
             found = f"AEDAT of version {lines[0][9:20] if lines else '3 without a header'}"
             raise unreadable(path, 0, found, "2.0, 3.1 and 4 are read: convert it with DV or jAER")
