@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +11,11 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.optics import GGX, View, light_transport_matrix
 from evnlos.optics.facets import (
     MASKING,
+    Cells,
     Pose,
+    Seen,
     SlopeTable,
+    SparseImages,
     carry_facets,
     carry_lobes,
     facet_matrix,
@@ -56,15 +58,15 @@ def table(seed=0, scale=0.05) -> SlopeTable:
         np.array([[0.05, 0.12], [0.2, 0.15]]), np.array([1.0, 0.3]), scale=scale, matte=0.4
     )
     bumps = np.random.default_rng(seed).normal(0, 0.3, first.log_density.shape)
-    return replace(first, log_density=first.log_density + bumps)
+    return first._replace(log_density=first.log_density + bumps)
 
 
 def slow_matrix(pose: Pose, wall: SlopeTable, shape, plane) -> np.ndarray:
     """f cos_i cos_t / r^2 times the cell's area, pair by pair, from the definition."""
     seen, cells = seen_points(pose, shape, *pixels(shape)), target_cells(pose, plane)
-    out = np.empty((len(seen.points), len(cells)))
+    out = np.empty((len(seen.points), len(cells.points)))
     for p, (point, frame, eye) in enumerate(zip(seen.points, seen.frames, seen.eyes, strict=True)):
-        away = cells - point
+        away = cells.points - point
         r = np.linalg.norm(away, axis=1)
         light = (away / r[:, None]) @ frame.reshape(3, 3).T
         half = light + eye
@@ -76,19 +78,12 @@ def slow_matrix(pose: Pose, wall: SlopeTable, shape, plane) -> np.ndarray:
 
         facets = density / half[:, 2] ** 4 * seen_share(light[:, 2]) * seen_share(eye[2])
         brdf = facets / (4 * light[:, 2] * eye[2]) + wall.matte / math.pi
-        out[p] = brdf * light[:, 2] * (away[:, 2] / r) / r**2 * plane.pitch_m**2
+        out[p] = brdf * light[:, 2] * (away[:, 2] / r) / r**2 * cells.area
     return out
 
 
-def sparse(pictures: np.ndarray) -> tuple[Any, Any, Any]:
-    frame, index = np.nonzero(pictures)
-    starts = np.searchsorted(frame, np.arange(len(pictures) + 1)).astype(np.int64)
-    return starts, index.astype(np.int64), pictures[frame, index]
-
-
-def parts(pose: Pose = POSE) -> tuple[Any, Any, Any, Any, float]:
-    seen = seen_points(pose, SHAPE, *pixels())
-    return seen.points, seen.frames, seen.eyes, target_cells(pose, PLANE), PLANE.pitch_m**2
+def parts(pose: Pose = POSE) -> tuple[Seen, Cells]:
+    return seen_points(pose, SHAPE, *pixels()), target_cells(pose, PLANE)
 
 
 def test_a_plain_pose_sees_the_points_of_a_perspective_view():
@@ -144,8 +139,8 @@ def test_carried_images_are_the_matrix_times_the_images():
     pictures = rng.uniform(0, 1, (5, 28)) * (rng.uniform(0, 1, (5, 28)) < 0.3)
     wall, place = table(), parts()
     matrix, out = np.empty((126, 28)), np.empty((126, 5))
-    fill_facets(matrix, *place, wall.log_density, wall.scale, wall.step, wall.matte, MASKING)
-    carry_facets(out, *place, wall.log_density, wall.scale, wall.step, wall.matte, MASKING, *sparse(pictures))
+    fill_facets(matrix, *place, wall, MASKING)
+    carry_facets(out, *place, wall, MASKING, SparseImages.of(pictures))
     np.testing.assert_allclose(out, matrix @ pictures.T, rtol=1e-9)
 
 
@@ -156,11 +151,12 @@ def test_derivatives_are_differences():
     column = np.arange(wall.nodes**2).reshape(wall.nodes, wall.nodes)
     column[-1, -1] = column[0, 0]  # two coefficients that are one number
     out = np.empty((126, 3, wall.nodes**2 + 1))
-    facet_slopes(out, *place, wall.log_density, wall.scale, wall.step, MASKING, column, *sparse(pictures))
+    facet_slopes(out, *place, wall, MASKING, column, SparseImages.of(pictures))
 
     def light(log_density, matte):
         made = np.empty((126, 3))
-        carry_facets(made, *place, log_density, wall.scale, wall.step, matte, MASKING, *sparse(pictures))
+        at = wall._replace(log_density=log_density, matte=matte)
+        carry_facets(made, *place, at, MASKING, SparseImages.of(pictures))
         return made
 
     step, middle = 1e-5, wall.nodes // 2
@@ -179,11 +175,11 @@ def test_lobes_are_tables_of_lobes():
     pictures = np.random.default_rng(3).uniform(0, 1, (2, 28))
     alphas, place = np.array([[0.1, 0.1], [0.1, 0.25]]), parts()
     out = np.empty((126, 2, 3))
-    carry_lobes(out, *place, alphas, MASKING, *sparse(pictures))
+    carry_lobes(out, *place, alphas, MASKING, SparseImages.of(pictures))
     for k in range(2):
         fine = SlopeTable.of_lobes(alphas[k : k + 1], np.ones(1), scale=0.1, step=0.1)
         made = np.empty((126, 2))
-        carry_facets(made, *place, fine.log_density, fine.scale, fine.step, 0.0, MASKING, *sparse(pictures))
+        carry_facets(made, *place, fine, MASKING, SparseImages.of(pictures))
         np.testing.assert_allclose(out[..., k], made, rtol=0.02)
 
 

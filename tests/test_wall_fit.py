@@ -16,7 +16,7 @@ from evnlos.calibration.wall_search import fit_wall, travelled
 from evnlos.data import Capture, CaptureInfo
 from evnlos.data.capture_info import CameraInfo, MotionInfo, TargetInfo
 from evnlos.errors import ConfigError, DataError
-from evnlos.lab import Lobe, Optics, Reflection, cast, fill_throughput
+from evnlos.lab import LitCells, Lobe, Optics, Reflection, cast, fill_throughput
 from evnlos.optics.facets import Pose, SlopeTable
 from evnlos.report.sections import setup_section
 from evnlos.scene import FontGlyphs
@@ -40,12 +40,9 @@ def operator(bent: float = 0.0, corner: float = 0.0) -> np.ndarray:
     rays = cast(optics)
     reflection = Reflection((Lobe("ggx", 0.6, 0.06, 0.06), Lobe("beckmann", 0.4, 0.08, 0.2)), matte=0.02)
     y, x = np.meshgrid(WIDE.y_m, WIDE.x_m, indexing="ij")
-    cells = np.stack([x.ravel() - 0.165, y.ravel() + 0.004], axis=1)
-    out = np.zeros((SHAPE[0] * SHAPE[1], len(cells)), np.float32)
-    fill_throughput(
-        out, rays.point, rays.frame, rays.eye, rays.share, cells, np.full(len(cells), WIDE.pitch_m**2), 0.3,
-        reflection.table(), np.zeros((0, 4)),
-    )  # fmt: skip
+    cells = LitCells(x.ravel() - 0.165, y.ravel() + 0.004, np.full(x.size, WIDE.pitch_m**2), 0.3)
+    out = np.zeros((SHAPE[0] * SHAPE[1], x.size), np.float32)
+    fill_throughput(out, rays, cells, reflection.table(), np.zeros((0, 4)))
     return out
 
 
@@ -226,13 +223,12 @@ def test_normal_equations_are_those_of_the_residual(rendered):
         k -= len(FREEDOMS)
         if k < count:
             log_density = state.table.log_density + step * (column == k)
-            return replace(state, table=replace(state.table, log_density=log_density)).residual(data)
+            return replace(state, table=state.table._replace(log_density=log_density)).residual(data)
         k -= count
         if k < 5:
             return WallState(pose, state.table, step * np.eye(5)[k]).residual(data)
-        return replace(
-            state, table=replace(state.table, matte=state.table.matte + step * unknowns.matte)
-        ).residual(data)
+        matte = state.table.matte + step * unknowns.matte
+        return replace(state, table=state.table._replace(matte=matte)).residual(data)
 
     middle = len(FREEDOMS) + column[state.table.nodes // 2, state.table.nodes // 2]
     chosen = [0, 5, middle, middle - 1, size - 4, size - 1]
@@ -277,8 +273,8 @@ def test_texture_and_operator_errors_are_told_from_noise(rendered):
     weights = np.sin(40 * np.add.outer(PLANE.y_m, PLANE.x_m)).ravel() * 1e-3
     pictures = [np.zeros((PLANE.height * PLANE.width, d.seen.shape[1])) for d in (data, data)]
     for n in range(data.seen.shape[1]):
-        part = slice(data.starts[n], data.starts[n + 1])
-        pictures[0][data.index[part], n] = data.light[part]
+        part = slice(*data.images.starts[n : n + 2])
+        pictures[0][data.images.cell[part], n] = data.images.light[part]
     wrong = light + np.linspace(0, 1, len(light))[:, None] * (weights @ pictures[0])
     own = replace(data, seen=wrong)
     left, right, after = correction_of(own, light, own, light)

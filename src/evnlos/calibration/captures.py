@@ -19,6 +19,7 @@ from evnlos.data.capture import Capture, by_name, read_capture
 from evnlos.data.sampling import character_of, reduce_by_area
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
+from evnlos.optics.facets import SparseImages
 from evnlos.optics.interpolation import point_samples
 from evnlos.scene import HandwritingGlyphs, LineMotion, Scene
 from evnlos.setups import PaperSetup, RadiometricSetup
@@ -279,9 +280,7 @@ class WallData:
         pixel: Number of each pixel in them [P].
         places: Place (x, y) of the target in each frame [N, 2], metres.
         plane: Cells of the targets' images.
-        starts: Where each image's entries begin [N + 1].
-        index: Cell of each entry.
-        light: Brightness of each entry.
+        images: The targets' images [N].
     """
 
     shape: tuple[int, int]
@@ -295,9 +294,7 @@ class WallData:
     pixel: NDArray[np.int64]
     places: Array
     plane: Plane
-    starts: NDArray[np.int64]
-    index: NDArray[np.int64]
-    light: Array
+    images: SparseImages
 
     def shared_removed(self, values: NDArray) -> NDArray:
         """Return values [P, N, ...] without what the frames of a group share."""
@@ -365,7 +362,6 @@ def wall_data(
     light = np.ascontiguousarray(seen.reshape(len(seen), -1).T[keep], dtype=np.float64)
     level = light.mean(axis=1)
     weight = 1 / (level + 0.05 * level.max() + 1e-9)
-    frame, index = np.nonzero(drawn)
     return WallData(
         capture_set.shape,
         ((u.ravel() + 0.5) * width / grid[1] - 0.5)[keep],
@@ -378,9 +374,7 @@ def wall_data(
         np.flatnonzero(keep),
         np.concatenate(places),
         plane,
-        np.searchsorted(frame, np.arange(len(drawn) + 1)).astype(np.int64),
-        index.astype(np.int64),
-        drawn[frame, index].astype(np.float64),
+        SparseImages.of(drawn),
     )
 
 

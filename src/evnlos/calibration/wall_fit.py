@@ -23,7 +23,9 @@ from evnlos.errors import ConfigError
 from evnlos.machine import note
 from evnlos.optics.facets import (
     MASKING,
+    Cells,
     Pose,
+    Seen,
     SlopeTable,
     carry_facets,
     carry_lobes,
@@ -126,21 +128,16 @@ class WallState:
     table: SlopeTable
     sensitivity: Array = field(default_factory=lambda: np.zeros(5))
 
-    def place(self, data: WallData, pose: Pose | None = None) -> tuple[Array, Array, Array, Array, float]:
-        """Return wall points, their frames, directions to the eye, target cells and their area."""
+    def place(self, data: WallData, pose: Pose | None = None) -> tuple[Seen, Cells]:
+        """Return wall points and target cells."""
         pose = self.pose if pose is None else pose
-        seen = seen_points(pose, data.shape, data.columns, data.rows)
-        return seen.points, seen.frames, seen.eyes, target_cells(pose, data.plane), data.plane.pitch_m**2
+        return seen_points(pose, data.shape, data.columns, data.rows), target_cells(pose, data.plane)
 
     def light(self, data: WallData, pose: Pose | None = None) -> Array:
         """Return what the pixels see, without light that does not come from the targets, [P, N]."""
         out = np.empty(data.seen.shape)
-        table = self.table
         with torchs_threads():
-            carry_facets(
-                out, *self.place(data, pose), table.log_density, table.scale, table.step, table.matte, MASKING,
-                data.starts, data.index, data.light,
-            )  # fmt: skip
+            carry_facets(out, *self.place(data, pose), self.table, MASKING, data.images)
         return out * np.exp(data.monomials() @ self.sensitivity)[:, None]
 
     def residual(self, data: WallData) -> Array:
@@ -166,10 +163,7 @@ def start_at(data: WallData, pose: Pose, lobes: Array = LOBES) -> tuple[WallStat
     cells = target_cells(pose, data.plane)
     out = np.empty((*data.seen.shape, len(lobes) + 1))
     with torchs_threads():
-        carry_lobes(
-            out, seen.points, seen.frames, seen.eyes, cells, data.plane.pitch_m**2, lobes, MASKING,
-            data.starts, data.index, data.light,
-        )  # fmt: skip
+        carry_lobes(out, seen, cells, lobes, MASKING, data.images)
     root = np.sqrt(data.weight)[:, None]
     basis = (data.shared_removed(out) * root[..., None]).reshape(-1, len(lobes) + 1)
     wanted = (data.shared_removed(data.seen) * root).ravel()
@@ -250,7 +244,7 @@ class _Unknowns:
             pose = freedom.moved(pose, float(np.clip(by, -freedom.spread, freedom.spread)))
         slopes = np.clip(step[self.poses : self.poses + self.count], -2, 2)[self.column]
         matte = max(0.0, state.table.matte + float(step[-1]) * self.matte)
-        table = replace(state.table, log_density=state.table.log_density + slopes, matte=matte)
+        table = state.table._replace(log_density=state.table.log_density + slopes, matte=matte)
         return WallState(pose, table, state.sensitivity + step[self.poses + self.count : -1])
 
     def _folded(self, table: Array) -> Array:
@@ -351,7 +345,7 @@ def normal_equations(
             moves.append((state.light(data, freedom.moved(state.pose, freedom.step)) - light) / freedom.step)
         except ConfigError:
             moves.append((light - state.light(data, freedom.moved(state.pose, -freedom.step))) / freedom.step)
-    points, frames, eyes, cells, area = state.place(data)
+    seen, cells = state.place(data)
     monomials, root = data.monomials(), np.sqrt(data.weight).astype(np.float32)
     gain = np.exp(monomials @ state.sensitivity)
     gram, right = np.zeros((unknowns.size, unknowns.size)), np.zeros(unknowns.size)
@@ -362,10 +356,7 @@ def normal_equations(
         own = light[part]
         slopes = np.empty((*own.shape, count + 1), np.float32)
         with torchs_threads():
-            facet_slopes(
-                slopes, points[part], frames[part], eyes[part], cells, area, table.log_density, table.scale,
-                table.step, MASKING, unknowns.column, data.starts, data.index, data.light,
-            )  # fmt: skip
+            facet_slopes(slopes, seen.part(part), cells, table, MASKING, unknowns.column, data.images)
         jac = np.empty((*own.shape, unknowns.size), np.float32)
         for k, move in enumerate(moves):
             jac[..., k] = move[part]

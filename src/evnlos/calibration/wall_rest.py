@@ -305,16 +305,13 @@ def companion_of(
 def _moving_matrix(data: WallData, state: WallState, places: Array, plane: Plane, sensitivity: Array) -> Array:
     """Return what the pixels see of each cell of an image at each place, [P, S, h w]."""
     seen = seen_points(state.pose, data.shape, data.columns, data.rows)
-    table, here = state.table, target_cells(state.pose, plane)
+    here = target_cells(state.pose, plane)
     out = np.empty((len(data.columns), len(places), plane.height * plane.width))
     for k, (x, y) in enumerate(places):
         part = np.empty((len(out), out.shape[2]))
-        cells = here + np.array([x, y, x * state.pose.travel_slope])
+        cells = here._replace(points=here.points + np.array([x, y, x * state.pose.travel_slope]))
         with torchs_threads():
-            fill_facets(
-                part, seen.points, seen.frames, seen.eyes, cells, plane.pitch_m**2, table.log_density,
-                table.scale, table.step, table.matte, MASKING,
-            )  # fmt: skip
+            fill_facets(part, seen, cells, state.table, MASKING)
         out[:, k] = part * sensitivity[:, None]
     return out
 
@@ -335,7 +332,7 @@ def _neighbours(plane: Plane) -> Array:
 
 def _dense(data: WallData) -> Array:
     """Return the targets' images [Q, N]."""
-    out = np.zeros((data.plane.height * data.plane.width, len(data.starts) - 1))
-    frame = np.repeat(np.arange(out.shape[1]), np.diff(data.starts))
-    out[data.index, frame] = data.light
+    starts, cell, light = data.images
+    out = np.zeros((data.plane.height * data.plane.width, len(starts) - 1))
+    out[cell, np.repeat(np.arange(out.shape[1]), np.diff(starts))] = light
     return out

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -61,26 +61,86 @@ def _decay_map(newest, end, tau_us, never, surface):
             out[column] = np.float32(0.0) if times[column] == never or powers[column] == -126.0 else out[column]
 
 
+class Grids(NamedTuple):
+    """Events [N] of one sensor, and the grids that surfaces are made for.
+
+    Args:
+        t_us: Times, microseconds, ascending.
+        x: Columns.
+        y: Rows.
+        p: Whether the light grew.
+        edges: Ascending edges [grids + 1], microseconds.
+        starts: Index of the first event after each edge [grids + 1].
+        tau_us: Time constant, microseconds.
+        carry: Whether earlier events count.
+    """
+
+    t_us: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    p: NDArray[np.bool_]
+    edges: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    tau_us: float
+    carry: bool
+
+
+class TimeMap(NamedTuple):
+    """Times of the newest events of each pixel.
+
+    Args:
+        newest: Times since `origin`, microseconds, int32 or int64 [2, H, W], ON first; margins may surround it.
+        never: What stands there where there was none.
+        origin: Its zero, microseconds.
+    """
+
+    newest: NDArray
+    never: int
+    origin: int
+
+
+class Near(NamedTuple):
+    """The neighbourhood of an event, and what a surface keeps of it.
+
+    Args:
+        spans: Half width of each row of the neighbourhood, from its top to its bottom [2 radius + 1], pixels.
+        is_box: Whether all rows are as wide.
+        whole_area: Pixels to take the mean over; 0 = those on the sensor.
+        projection: `SUM`, `LAST` or `MAX` of the events of a pixel.
+        include_self: Whether an event finds itself.
+    """
+
+    spans: NDArray[np.int64]
+    is_box: bool
+    whole_area: int
+    projection: int
+    include_self: bool
+
+
 # Places in flat maps are counted without a sign, or every access would be checked for a negative index.
 
 
 @njit(cache=True)
-def sae(t_us, x, y, p, edges, starts, tau_us, carry, newest, never, origin, surfaces):
-    """Fill [grids, 2, H, W]; `newest` [2, H, W] holds times since `origin`, `never` where there is none."""
+def sae(grids: Grids, times: TimeMap, surfaces: NDArray) -> None:
+    """Fill [grids, 2, H, W] with exp(-(end - newest) / tau), 0 where a pixel has no event."""
+    t_us, x, y, p, starts, edges = grids.t_us, grids.x, grids.y, grids.p, grids.starts, grids.edges
+    newest, never, origin = times
     height, width = newest.shape[1], newest.shape[2]
     flat = newest.reshape(-1)
     lines = newest.reshape(2 * height, width)
     off = np.uint32(height * width)
-    first = 0 if carry else starts[0]
+    first = 0 if grids.carry else starts[0]
     for grid in range(len(edges) - 1):
-        if not carry:
+        if not grids.carry:
             newest[:] = never
             first = starts[grid]
         for index in range(first, starts[grid + 1]):
             pixel = np.uint32(y[index]) * np.uint32(width) + np.uint32(x[index])
             flat[pixel + (np.uint32(0) if p[index] else off)] = t_us[index] - origin
         first = starts[grid + 1]
-        _decay_map(lines, edges[grid + 1] - origin, tau_us, never, surfaces[grid].reshape(2 * height, width))
+        _decay_map(
+            lines, edges[grid + 1] - origin, grids.tau_us, never, surfaces[grid].reshape(2 * height, width)
+        )
 
 
 @njit(cache=True)
@@ -94,25 +154,10 @@ def _put(surface, row, column, value, projection):
 
 
 @njit(cache=True)
-def context(
-    t_us,
-    x,
-    y,
-    p,
-    edges,
-    starts,
-    tau_us,
-    carry,
-    projection,
-    include_self,
-    spans,
-    is_box,
-    newest,
-    never,
-    origin,
-    out,
-):
-    """Fill [grids, 2, H, W] with the projection of each event's context.
+def context(grids: Grids, near: Near, times: TimeMap, out: NDArray) -> None:
+    """Fill [grids, 2, H, W] with the projection of each event's context, exp(-(t - t*) / tau).
+
+    t* is the newest time in the event's neighbourhood before it.
 
     Times ascend, so that overwriting is the maximum. For a box an event overwrites the 2 radius + 1 pixels of
     its own row that have it in reach, and t* is the maximum over the rows in reach: (2 radius + 1) writes and
@@ -120,74 +165,66 @@ def context(
     in reach, and t* is one read. `newest` [2, H + 2 radius, W + 2 radius] has margins, so that no loop is cut
     at a border; they are never read for a pixel of the sensor that has no event in reach.
     """
+    t_us, x, y, p, starts, edges = grids.t_us, grids.x, grids.y, grids.p, grids.starts, grids.edges
+    newest, never, origin = times
+    spans, is_box, include_self = near.spans, near.is_box, near.include_self
     radius = len(spans) // 2
     reach = np.uint64(len(spans))
     middle = np.uint64(radius)
-    scale = -1.0 / tau_us
-    first = 0 if carry else starts[0]
+    scale = -1.0 / grids.tau_us
+    first = 0 if grids.carry else starts[0]
     for grid in range(len(edges) - 1):
-        if not carry:
+        if not grids.carry:
             newest[:] = never
             first = starts[grid]
         for index in range(first, starts[grid + 1]):
             sign, row, column = np.uint64(0 if p[index] else 1), np.uint64(y[index]), np.uint64(x[index])
-            times = newest[sign]
+            own = newest[sign]
             time = t_us[index] - origin
             if index >= starts[grid]:
-                before = np.int64(times[row + middle, column + middle])
+                before = np.int64(own[row + middle, column + middle])
                 if is_box:
                     for step in range(reach):
-                        before = max(before, np.int64(times[row + step, column + middle]))
+                        before = max(before, np.int64(own[row + step, column + middle]))
                 value = np.float32(1.0)
                 if not include_self and before != time:
                     value = np.float32(0.0) if before == never else np.float32(np.exp((time - before) * scale))
-                _put(out[grid, sign], row, column, value, projection)
+                _put(out[grid, sign], row, column, value, near.projection)
             if is_box:
-                line = times[row + middle]
+                line = own[row + middle]
                 for step in range(reach):
                     line[column + step] = time
             else:
                 for step in range(reach):
                     span = np.uint64(spans[step])
-                    line = times[row + step]
+                    line = own[row + step]
                     for at in range(column + middle - span, column + middle + span + np.uint64(1)):
                         line[at] = time
         first = starts[grid + 1]
 
 
 @njit(cache=True)
-def hots(
-    t_us,
-    x,
-    y,
-    p,
-    edges,
-    starts,
-    tau_us,
-    carry,
-    projection,
-    include_self,
-    spans,
-    whole_area,
-    newest,
-    never,
-    origin,
-    out,
-):
-    """Fill [grids, 2, H, W] with the projection of each event's mean decay over its neighbourhood."""
+def hots(grids: Grids, near: Near, times: TimeMap, out: NDArray) -> None:
+    """Fill [grids, 2, H, W] with the projection of each event's mean decay over its neighbourhood.
+
+    The decay of a pixel is exp(-(t - newest) / tau), 0 where there was no event.
+    """
+    t_us, x, y, p, starts, edges = grids.t_us, grids.x, grids.y, grids.p, grids.starts, grids.edges
+    newest, never, origin = times
+    spans, whole_area, projection = near.spans, near.whole_area, near.projection
     height, width = newest.shape[1], newest.shape[2]
     radius = len(spans) // 2
-    scale = -1.0 / tau_us
-    first = 0 if carry else starts[0]
+    scale = -1.0 / grids.tau_us
+    first = 0 if grids.carry else starts[0]
     for grid in range(len(edges) - 1):
         surface = out[grid]
-        if not carry:
+        if not grids.carry:
             newest[:] = never
             first = starts[grid]
         for index in range(first, starts[grid + 1]):
             sign, row, column = 1 - np.int64(p[index]), np.int64(y[index]), np.int64(x[index])
             time = t_us[index] - origin
-            if include_self:
+            if near.include_self:
                 newest[sign, row, column] = time
             if index >= starts[grid]:
                 total, pixels = 0.0, 0
@@ -237,13 +274,13 @@ def _spans(radius: int, shape: str) -> NDArray[np.int64]:
     return np.array([int(np.sqrt(radius**2 - row**2 + 1e-9)) for row in rows], np.int64)
 
 
-def _time_map(events: Events, edges: NDArray[np.int64], margin: int) -> tuple[NDArray, int, int]:
-    """Return an empty map of newest times, its mark for "never" and its zero; 32 bits where they suffice."""
+def _time_map(events: Events, edges: NDArray[np.int64], margin: int) -> TimeMap:
+    """Return a map without any event; 32 bits where they suffice."""
     origin = int(min(events.t_us[0], edges[0])) if len(events) else int(edges[0])
     shape = (2, events.height + 2 * margin, events.width + 2 * margin)
     latest = int(max(events.t_us[-1], edges[-1])) if len(events) else int(edges[-1])
     dtype, never = (np.int32, -1) if latest - origin < 2**31 else (np.int64, -1)
-    return np.full(shape, never, dtype), never, origin
+    return TimeMap(np.full(shape, never, dtype), never, origin)
 
 
 def time_surface(
@@ -337,23 +374,22 @@ def iter_time_surfaces(
     _choice("border", border, ("crop", "zero"))
     _choice("projection", projection, tuple(_PROJECTIONS))
     starts = np.searchsorted(events.t_us, edges, side="right")
-    newest, never, origin = _time_map(events, edges, int(radius) if mode == "context" else 0)
+    times = _time_map(events, edges, int(radius) if mode == "context" else 0)
     spans = _spans(int(radius), shape)
     whole_area = int((2 * spans + 1).sum()) if border == "zero" else 0
+    near = Near(spans, shape == "box", whole_area, _PROJECTIONS[projection], include_self)
     step = grids or max(len(edges) - 1, 1)
     for at in range(0, max(len(edges) - 1, 1), step):
         some, ends = edges[at : at + step + 1], starts[at : at + step + 1]
-        first = 0 if at == 0 else int(ends[0])  # what came before is in `newest`
+        first = 0 if at == 0 else int(ends[0])  # what came before is in `times`
         part = slice(first, int(ends[-1]))
         columns = events.t_us[part], events.x[part], events.y[part], events.p[part]
         out = np.zeros((len(some) - 1, 2, events.height, events.width), np.float32)
-        inputs = (*columns, some, ends - first, float(tau_us), carry)
+        inputs = Grids(*columns, some, ends - first, float(tau_us), carry)
         if mode == "sae":
-            sae(*inputs, newest, never, origin, out)
+            sae(inputs, times, out)
+        elif mode == "context":
+            context(inputs, near, times, out)
         else:
-            chosen = (*inputs, _PROJECTIONS[projection], include_self, spans)
-            if mode == "context":
-                context(*chosen, shape == "box", newest, never, origin, out)
-            else:
-                hots(*chosen, whole_area, newest, never, origin, out)
+            hots(inputs, near, times, out)
         yield out

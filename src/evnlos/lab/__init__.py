@@ -1,10 +1,11 @@
 """A second renderer, for captures that the simulator's own models of a setup do not describe."""
 
-from evnlos.lab.light_path import Lobe, Optics, Rays, Reflection, cast, fill_throughput, texture
+from evnlos.lab.light_path import LitCells, Lobe, Optics, Rays, Reflection, cast, fill_throughput, texture
 from evnlos.lab.room import FilmedLight, Mount, Phone, RenderedWall, Torch, brightness, covered_plane
 
 __all__ = [
     "FilmedLight",
+    "LitCells",
     "Lobe",
     "Mount",
     "Optics",

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -201,8 +201,7 @@ def reflected(ix: float, iy: float, iz: float, ox: float, oy: float, oz: float, 
     return value + fresnel * masking * density / (4.0 * oz * c2 * c2)
 
 
-@dataclass(frozen=True, eq=False)
-class Rays:
+class Rays(NamedTuple):
     """Where the rays of the pixels meet the wall, in which frame, and from where they are seen.
 
     Args:
@@ -334,26 +333,41 @@ def _meet(origin: Array, ray: Array, curvature: tuple[float, float]) -> Array:
         return origin + t[..., None] * ray
 
 
+class LitCells(NamedTuple):
+    """The cells of the target plane.
+
+    Args:
+        x_m: x of their centres [C], metres.
+        y_m: y of their centres [C], metres.
+        emission: Radiance times area of each cell [C].
+        distance_m: z of the cells.
+    """
+
+    x_m: Array
+    y_m: Array
+    emission: Array
+    distance_m: float
+
+
+class _Scratch(NamedTuple):
+    """Room for what one ray tells of each cell [C]: factors of facets and matte wall, and the slopes (u, v)."""
+
+    facet: Array
+    matte: Array
+    u: Array
+    v: Array
+
+
 @njit(cache=True, error_model="numpy", fastmath=STRICT)
 def _add_ray(
-    total: Array,
-    facet: Array,
-    matte: Array,
-    u: Array,
-    v: Array,
-    point: Array,
-    m: Array,
-    eye: Array,
-    share: float,
-    x_m: Array,
-    y_m: Array,
-    distance_m: float,
-    table: Array,
-    blockers: Array,
+    total: Array, scratch: _Scratch, rays: Rays, p: int, s: int, cells: LitCells, table: Array, blockers: Array
 ) -> None:
-    """Add share f(i, o) cos i cos t / r^2 of one ray to `total`, cell by cell; the other [C] are scratch."""
+    """Add share f(i, o) cos i cos t / r^2 of ray s of pixel p to `total` [C], cell by cell."""
+    point, m, eye, share = rays.point[p, s], rays.frame[p, s], rays.eye[p, s], rays.share[p, s]
+    facet, matte, u, v = scratch.facet, scratch.matte, scratch.u, scratch.v
+    x_m, y_m = cells.x_m, cells.y_m
     last = table.shape[0] - 1
-    dz = distance_m - point[2]
+    dz = cells.distance_m - point[2]
     px, py = point[0], point[1]
     ox, oy, oz = eye[0], eye[1], eye[2]
     ax, ay, az = m[0, 0], m[0, 1], m[0, 2] * dz
@@ -392,16 +406,7 @@ def _add_ray(
 
 @njit(cache=True, parallel=True)
 def fill_throughput(
-    out: NDArray[np.float32],
-    point: Array,
-    frame: Array,
-    eye: Array,
-    share: Array,
-    cells: Array,
-    emission: Array,
-    distance_m: float,
-    table: Array,
-    blockers: Array,
+    out: NDArray[np.float32], rays: Rays, cells: LitCells, table: Array, blockers: Array
 ) -> None:
     """Fill out [P, C] with the pixels' radiance for cells of brightness 1, ray by ray and cell by cell.
 
@@ -409,39 +414,19 @@ def fill_throughput(
 
     Args:
         out: Overwritten.
-        point: Wall points [P, S, 3], metres.
-        frame: Tangents and normal [P, S, 3, 3].
-        eye: Directions to the lens in that frame [P, S, 3], before the wall.
-        share: Weights of the rays [P, S].
-        cells: Centres (x, y) of the cells [C, 2], metres.
-        emission: Radiance times area of each cell [C].
-        distance_m: z of the cells.
+        rays: Rays of the pixels [P].
+        cells: Cells [C].
         table: As `Reflection.table` makes it.
         blockers: Opaque discs parallel to the wall [B, 4]: (x, y, z, radius), metres.
     """
-    x_m, y_m = cells[:, 0].copy(), cells[:, 1].copy()
     for p in prange(out.shape[0]):
-        total, facet, matte = np.zeros(out.shape[1]), np.empty(out.shape[1]), np.empty(out.shape[1])
-        u, v = np.empty(out.shape[1]), np.empty(out.shape[1])
-        for s in range(point.shape[1]):
-            _add_ray(
-                total,
-                facet,
-                matte,
-                u,
-                v,
-                point[p, s],
-                frame[p, s],
-                eye[p, s],
-                share[p, s],
-                x_m,
-                y_m,
-                distance_m,
-                table,
-                blockers,
-            )
-        for c in range(out.shape[1]):
-            out[p, c] = total[c] * emission[c]
+        size = out.shape[1]
+        total = np.zeros(size)
+        scratch = _Scratch(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
+        for s in range(rays.point.shape[1]):
+            _add_ray(total, scratch, rays, p, s, cells, table, blockers)
+        for c in range(size):
+            out[p, c] = total[c] * cells.emission[c]
 
 
 def texture(x_m: Array, y_m: Array, seed: int, smooth: float, fine: float, grain: float) -> Array:

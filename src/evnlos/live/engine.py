@@ -158,7 +158,8 @@ class RunningSurface:
             raise DataError(f"a surface at {t_us} us, with an event at {self._newest} us; ask for a later one")
         edges = np.array([t_us, t_us], np.int64)
         columns = (_NO_TIMES, _NO_PLACES, _NO_PLACES, _NO_SIGNS)
-        kernels.sae(*columns, edges, _NO_STARTS, self.tau_us, True, self._times, _NEVER, self._origin, out)
+        grids = kernels.Grids(*columns, edges, _NO_STARTS, self.tau_us, True)
+        kernels.sae(grids, kernels.TimeMap(self._times, _NEVER, self._origin), out)
         return out[0]
 
 

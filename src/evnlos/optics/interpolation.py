@@ -12,6 +12,7 @@ Indices are unsigned: an index that can't be negative needs no test, and a loop 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -143,9 +144,35 @@ def spline_scattered(coefficients: torch.Tensor, row: torch.Tensor, column: torc
     return value
 
 
+class _Sheet(NamedTuple):
+    """What is written, and what is read.
+
+    Args:
+        out: Light [T, N], overwritten.
+        band: Spline coefficients at the frame's rows [H, C]; zero outside.
+        taps: The four weights at each instant [T, 4].
+        ambient: Ambient light [H, W], white levels.
+        scale: White levels per unit of the band.
+        white: What a white level is written as.
+    """
+
+    out: NDArray[np.float32]
+    band: NDArray
+    taps: NDArray[np.float32]
+    ambient: NDArray[np.float32]
+    scale: np.float32
+    white: np.float32
+
+
 @njit(cache=True, error_model="numpy")
-def _inside(out, k, to, count, band, v, start, tap_0, tap_1, tap_2, tap_3, scale, ambient, u, white):
-    """Write `count` pixels whose taps all lie inside; the taps are numbers, so that the loop is vectors."""
+def _inside(sheet, k, to, count, v, start, u):
+    """Write `count` pixels whose taps all lie inside, from column `to` on.
+
+    out[k, to + i] = white (scale max(0, sum_j taps[k, j] band[v, start + i + j]) + ambient[v, u + i])
+    """
+    out, band, ambient, scale, white = sheet.out, sheet.band, sheet.ambient, sheet.scale, sheet.white
+    # The taps are numbers, so that the loop is vectors.
+    tap_0, tap_1, tap_2, tap_3 = sheet.taps[k, 0], sheet.taps[k, 1], sheet.taps[k, 2], sheet.taps[k, 3]
     k, to, v, start, u = np.uint64(k), np.uint64(to), np.uint64(v), np.uint64(start), np.uint64(u)
     for i in range(np.uint64(count)):
         c = start + i
@@ -159,19 +186,20 @@ def _inside(out, k, to, count, band, v, start, tap_0, tap_1, tap_2, tap_3, scale
 
 
 @njit(cache=True, error_model="numpy")
-def _border(out, k, to, count, band, v, start, taps, scale, ambient, u, white):
-    """Write `count` pixels that have taps outside, where the band is zero."""
-    columns = band.shape[1]
+def _border(sheet, k, to, count, v, start, u):
+    """Write `count` pixels that have taps outside, where the band is zero; else as `_inside`."""
+    band, columns = sheet.band, sheet.band.shape[1]
     for i in range(count):
         light = np.float32(0)
         for c in range(max(0, start + i), min(columns, start + i + 4)):
-            light += taps[k, c - start - i] * np.float32(band[v, c])
-        out[k, to + i] = (scale * max(light, np.float32(0)) + ambient[v, u + i]) * white
+            light += sheet.taps[k, c - start - i] * np.float32(band[v, c])
+        sheet.out[k, to + i] = (sheet.scale * max(light, np.float32(0)) + sheet.ambient[v, u + i]) * sheet.white
 
 
 @njit(cache=True, error_model="numpy")
-def _dark(out, k, to, count, ambient, v, u, white):
-    """Write `count` pixels that no tap reaches."""
+def _dark(sheet, k, to, count, v, u):
+    """Write `count` pixels that no tap reaches: their ambient light."""
+    out, ambient, white = sheet.out, sheet.ambient, sheet.white
     k, to, v, u = np.uint64(k), np.uint64(to), np.uint64(v), np.uint64(u)
     for i in range(np.uint64(count)):
         out[k, to + i] = ambient[v, u + i] * white
@@ -203,7 +231,7 @@ def expose_shifted(
         white: What a white level is written as.
     """
     width, columns = ambient.shape[1], band.shape[1]
-    scale, unit = np.float32(gain), np.float32(white)
+    sheet = _Sheet(out, band, taps, ambient, np.float32(gain), np.float32(white))
     done = 0
     while done < out.shape[1]:
         v, u = divmod(first + done, width)
@@ -215,16 +243,11 @@ def expose_shifted(
             far = max(near, min(count, columns - start))
             begin = min(max(near, -start), far)
             end = max(begin, min(far, columns - 3 - start))
-            _dark(out, k, done, near, ambient, v, u, unit)
-            _border(
-                out, k, done + near, begin - near, band, v, start + near, taps, scale, ambient, u + near, unit
-            )
-            _inside(
-                out, k, done + begin, end - begin, band, v, start + begin, taps[k, 0], taps[k, 1], taps[k, 2],
-                taps[k, 3], scale, ambient, u + begin, unit,
-            )  # fmt: skip
-            _border(out, k, done + end, far - end, band, v, start + end, taps, scale, ambient, u + end, unit)
-            _dark(out, k, done + far, count - far, ambient, v, u + far, unit)
+            _dark(sheet, k, done, near, v, u)
+            _border(sheet, k, done + near, begin - near, v, start + near, u + near)
+            _inside(sheet, k, done + begin, end - begin, v, start + begin, u + begin)
+            _border(sheet, k, done + end, far - end, v, start + end, u + end)
+            _dark(sheet, k, done + far, count - far, v, u + far)
         done += count
 
 

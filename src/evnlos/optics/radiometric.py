@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -122,76 +123,97 @@ def torchs_threads() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-@njit(cache=True, parallel=True)
-def fill_matrix(
-    out: NDArray,
-    wall: Array,
-    wall_weight: Array,
-    target_x: Array,
-    target_y: Array,
-    target_weight: Array,
-    emission: Array,
-    distance_m: float,
-    eye: Array,
-    metal: Array,
-    albedo: float,
-    exponent: Array,
-    corners: Array,
-    ends: Ends,
-) -> None:
-    """Fill the matrix row by row; rows are independent, so any number of threads gives the same numbers.
+class LitWall(NamedTuple):
+    """The wall and who looks at it.
 
     Args:
-        out: Matrix [P, h w], float32 or float64, overwritten.
-        wall: Wall points, [S, P, 2], metres: S quadrature points for each of P pixels.
-        wall_weight: Their weights [S].
-        target_x: x of the target points [q, w], metres: q quadrature points along each of w columns.
-        target_y: y of the target points [q, h], metres.
-        target_weight: Weights of the quadrature points [q] along either axis.
-        emission: Radiance times area of each cell [h w].
-        distance_m: Distance from wall to target, metres.
+        points: Wall points, [S, P, 2], metres: S quadrature points for each of P pixels.
+        weight: Their weights [S].
         eye: Pin-hole (x, y, z), metres.
         metal: (alpha x, alpha y, n, k) of a rough metal; alpha x = 0 asks for the matte wall.
         albedo: Albedo of the matte wall.
+    """
+
+    points: Array
+    weight: Array
+    eye: Array
+    metal: Array
+    albedo: float
+
+
+class LightCells(NamedTuple):
+    """The cells of the target plane, and what stands before it.
+
+    Args:
+        x: x of the target points [q, w], metres: q quadrature points along each of w columns.
+        y: y of the target points [q, h], metres.
+        weight: Weights of the quadrature points [q] along either axis.
+        emission: Radiance times area of each cell [h w].
         exponent: Exponents of the emission's extra fall with the angle in x and y.
+        distance_m: Distance from wall to target, metres.
         corners: Corners of all occluders [K, 3], metres.
         ends: For each occluder, the index after its last corner.
     """
-    width, height = target_x.shape[1], target_y.shape[1]
+
+    x: Array
+    y: Array
+    weight: Array
+    emission: Array
+    exponent: Array
+    distance_m: float
+    corners: Array
+    ends: Ends
+
+
+@njit(cache=True, parallel=True)
+def fill_matrix(out: NDArray, wall: LitWall, cells: LightCells) -> None:
+    """Fill the matrix row by row; rows are independent, so any number of threads gives the same numbers.
+
+        out[p, c] = emission_c sum over points of pixel and cell of weights f cos cos / r^2 fall, where lit
+
+    with f the wall's reflection, and fall what the emission has beyond Lambert's.
+
+    Args:
+        out: Matrix [P, h w], float32 or float64, overwritten.
+        wall: Wall points of the pixels [P].
+        cells: Cells [h w].
+    """
+    width, height, z = cells.x.shape[1], cells.y.shape[1], cells.distance_m
+    eye, exponent = wall.eye, cells.exponent
     for p in prange(out.shape[0]):
         total = np.zeros((height, width))
         value, dx, fall = np.empty(width), np.empty(width), np.ones(width)
-        shadow = np.empty((2, corners.shape[0]))
+        shadow = np.empty((2, cells.corners.shape[0]))
         to_eye = np.empty(3)
-        for s in range(wall.shape[0]):
-            wx, wy = wall[s, p, 0], wall[s, p, 1]
+        for s in range(wall.points.shape[0]):
+            wx, wy = wall.points[s, p, 0], wall.points[s, p, 1]
             ex, ey, ez = eye[0] - wx, eye[1] - wy, eye[2]
             length = math.sqrt(ex * ex + ey * ey + ez * ez)
             to_eye[0], to_eye[1], to_eye[2] = ex / length, ey / length, ez / length
-            _project(shadow, corners, wx, wy, distance_m)
-            for i in range(target_x.shape[0]):
+            _project(shadow, cells.corners, wx, wy, z)
+            for i in range(cells.x.shape[0]):
                 for c in range(width):
-                    dx[c] = target_x[i, c] - wx
+                    dx[c] = cells.x[i, c] - wx
                     if exponent[0] != 0.0:
-                        fall[c] = (1.0 + (dx[c] / distance_m) ** 2) ** (-0.5 * exponent[0])
-                for j in range(target_y.shape[0]):
-                    share = wall_weight[s] * target_weight[i] * target_weight[j]
+                        fall[c] = (1.0 + (dx[c] / z) ** 2) ** (-0.5 * exponent[0])
+                for j in range(cells.y.shape[0]):
+                    share = wall.weight[s] * cells.weight[i] * cells.weight[j]
                     for r in range(height):
-                        dy = target_y[j, r] - wy
-                        if metal[0] > 0:
-                            _metal_row(value, dx, dy, distance_m, to_eye, metal)
+                        dy = cells.y[j, r] - wy
+                        if wall.metal[0] > 0:
+                            _metal_row(value, dx, dy, z, to_eye, wall.metal)
                         else:
-                            _matte_row(value, dx, dy, distance_m, albedo)
-                        if ends.size > 0:
-                            _hide_row(value, target_x[i], target_y[j, r], shadow, ends)
+                            _matte_row(value, dx, dy, z, wall.albedo)
+                        if cells.ends.size > 0:
+                            _hide_row(value, cells.x[i], cells.y[j, r], shadow, cells.ends)
                         part = share
                         if exponent[1] != 0.0:
-                            part *= (1.0 + (dy / distance_m) ** 2) ** (-0.5 * exponent[1])
+                            part *= (1.0 + (dy / z) ** 2) ** (-0.5 * exponent[1])
                         for c in range(width):
                             total[r, c] += part * fall[c] * value[c]
         for r in range(height):
             for c in range(width):
-                out[p, r * width + c] = total[r, c] * emission[r * width + c]
+                out[p, r * width + c] = total[r, c] * cells.emission[r * width + c]
 
 
 _PARTS, _FEWEST = 16, 2048  # of a light path, so that progress moves; pixels of one: each costs a millisecond
@@ -442,8 +464,6 @@ def _fill(
     occluders: Sequence[Occluder],
 ) -> None:
     """Fill `matrix` by the compiled loop."""
-    # numba loads slowly
-
     metal, albedo = np.zeros(4), 0.0
     if isinstance(brdf, GGX):
         alpha_y = brdf.alpha if brdf.alpha_y is None else brdf.alpha_y
@@ -453,20 +473,18 @@ def _fill(
     patches = as_patches(source)
     sub, weight = (np.array(values) for values in gauss_points(over_cell))
     width, height = patches.size_m
-    constants = (
-        wall_weight.numpy(),
+    cells = LightCells(
         patches.x_m + _number(offset_m[0]) + sub[:, None] * width,
         patches.y_m + _number(offset_m[1]) + sub[:, None] * height,
         weight,
         emission.detach().flatten().double().numpy() * (width * height),
-        distance_m,
-        np.array(eye_m),
-        metal,
-        albedo,
         np.array(exponent, dtype=np.float64),
+        distance_m,
         np.array([corner for one in occluders for corner in one.vertices_m], np.float64).reshape(-1, 3),
         np.cumsum([len(one.vertices_m) for one in occluders], dtype=np.int64),
     )
+    seen = LitWall(wall.numpy(), wall_weight.numpy(), np.array(eye_m), metal, albedo)
     with torchs_threads():
         for rows in noted_rows(len(matrix)):
-            fill_matrix(matrix.numpy()[rows], wall[:, rows].contiguous().numpy(), *constants)
+            part = seen._replace(points=wall[:, rows].contiguous().numpy())
+            fill_matrix(matrix.numpy()[rows], part, cells)

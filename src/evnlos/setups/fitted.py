@@ -114,7 +114,7 @@ class FittedSetup(Setup):
             raise ConfigError(f"setup.slopes is {self.slopes}; give a factor above 0")
         # Slopes s times as large have the density P(slope / s) / s^2.
         shifted = table.log_density - 2 * math.log(self.slopes)
-        return replace(table, log_density=shifted, scale=table.scale * self.slopes)
+        return table._replace(log_density=shifted, scale=table.scale * self.slopes)
 
     def source(self) -> Plane:
         """Return the strip of cells, in the coordinates of the target's motion."""

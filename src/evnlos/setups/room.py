@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from evnlos.cameras import EventCamera
 from evnlos.errors import ConfigError
 from evnlos.lab import (
+    LitCells,
     Mount,
     Optics,
     Rays,
@@ -253,7 +254,7 @@ class RoomSetup(Setup):
             )
         x, y, _ = np.moveaxis(rays.point, -1, 0)
         albedo = texture(x, y, self.texture_seed, self.texture_smooth, self.texture_fine, self.grain)
-        return replace(rays, share=rays.share * albedo)
+        return rays._replace(share=rays.share * albedo)
 
     def throughput(self, shape: tuple[int, int], plane: Plane) -> NDArray[np.float32]:
         """Return the radiance of the pixels for each cell of brightness 1, without `gain`, float32 [H W, h w].
@@ -270,10 +271,9 @@ class RoomSetup(Setup):
             tx, ty, tz = self.lamp.place_m
             discs = np.array([[tx + ox, ty + oy, tz, self.lamp.body_m]])
         out = np.empty((shape[0] * shape[1], len(x)), np.float32)
-        places, table = np.stack([x + ox, y + oy], axis=1), self.reflection.table()
+        cells, table = LitCells(x + ox, y + oy, emission, self.distance_m), self.reflection.table()
         for here in noted_rows(len(out)):
-            seen = rays.point[here], rays.frame[here], rays.eye[here], rays.share[here]
-            fill_throughput(out[here], *seen, places, emission, self.distance_m, table, discs)
+            fill_throughput(out[here], Rays(*(values[here] for values in rays)), cells, table, discs)
         return out
 
     def _light_path(self) -> RoomSetup:
