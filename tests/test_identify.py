@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evnlos.analysis import AnalysisSettings, identify
-from evnlos.analysis.identify import counted, setup_table, singular_values, verdict
+from evnlos.analysis.identify import modes_above, setup_table, singular_values, verdict
 from evnlos.analysis.linearized import LinearEstimator, bars, finest_bars, linearized
 from evnlos.cameras import FrameCamera
 from evnlos.cli import main
@@ -135,7 +135,7 @@ def test_noise_is_that_of_the_camera(level, known):
     ],
 )
 def test_mode_counts_of_the_presets(name, count):
-    found = counted(singular_values(linearized(setup_preset(name)).matrix), 1e-2)
+    found = modes_above(singular_values(linearized(setup_preset(name)).matrix), 1e-2)
     assert abs(found - count) <= max(1, 0.03 * count)
 
 

@@ -241,7 +241,9 @@ def identify(
     plain = setup.without_artifacts()
     if plain is not None:
         wide = singular_values(linearized(plain, settings).matrix)
-        note = artifact_note(setup, plain, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
+        note = artifact_note(
+            setup, plain, modes_above(singular, KINK_LEVEL), modes_above(wide, KINK_LEVEL), KINK_LEVEL
+        )
         warnings += [note] if note else []
     noise = setup.resized(seen.shape).operator_noise(seen.target_plane)
     if noise is not None:
@@ -255,7 +257,7 @@ def identify(
         setup,
         settings,
         singular,
-        counted(singular, MODE_LEVEL),
+        modes_above(singular, MODE_LEVEL),
         zero_db,
         mean_db,
         targets.stroke_m,
@@ -362,7 +364,7 @@ def singular_values(matrix: torch.Tensor) -> torch.Tensor:
     return values / values[0]
 
 
-def counted(singular: torch.Tensor, level: float) -> int:
+def modes_above(singular: torch.Tensor, level: float) -> int:
     """Return how many singular values lie above a share of the largest."""
     return int((singular > level * singular[0]).sum())
 

@@ -29,7 +29,7 @@ from evnlos.cli.recordings import (
     ReadOptions,
     SelectionOptions,
     amount,
-    counted,
+    events_counted,
     look_of,
     result,
     say_of,
@@ -40,8 +40,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.events import Cleaner, CleanOptions, EventWriter
 from evnlos.events.files.columns import OnError
 from evnlos.events.recording import CropOptions, Recording
-from evnlos.machine import Progress, ProgressBars, Step
-from evnlos.machine import counted as frames_counted
+from evnlos.machine import Progress, ProgressBars, Step, counted
 from evnlos.types import Events, OutFile
 from evnlos.untrusted import no_file
 
@@ -212,7 +211,7 @@ class _Clock:
 
     def watched(self, video: Video, name: str, progress: Progress) -> Iterator[tuple[float, NDArray]]:
         time_s = 0.0
-        for time_s, light in frames_counted(video, progress, name, video.frames or 0):
+        for time_s, light in counted(video, progress, name, video.frames or 0):
             if time_s > self.stop_s:
                 break
             if time_s >= self.start_s:
@@ -325,9 +324,9 @@ class CleanCommand:
         )
         recording, cut = self.reading.open(self.file, self.on_error), self.taking.cut()
         with EventWriter(self.out, format=self.format) as writer:
-            cleaner.look(counted(recording.pieces(cut), f"look at {self.file.name}"))
+            cleaner.look(events_counted(recording.pieces(cut), f"look at {self.file.name}"))
             total = recording.report.events
-            for piece in cleaner.clean(counted(recording.pieces(cut), self.out.name, total)):
+            for piece in cleaner.clean(events_counted(recording.pieces(cut), self.out.name, total)):
                 writer.write(piece)
             if not writer.events:
                 writer.write(recording.blank(cut))

@@ -87,7 +87,7 @@ class SelectionOptions:
         return CropOptions(self.start, self.stop, Box(*self.box) if self.box else None, known_polarity)
 
 
-def counted(pieces: Iterable[Events], name: str, total: int | None = None) -> Iterator[Events]:
+def events_counted(pieces: Iterable[Events], name: str, total: int | None = None) -> Iterator[Events]:
     """Yield the pieces, and show how many events have gone by."""
     done = 0
     with ProgressBars() as progress:
@@ -148,7 +148,7 @@ class ConvertCommand:
         recording = self.reading.open(self.file, self.on_error)
         cut = self.taking.cut(self.keep_known_polarity)
         with EventWriter(self.out, format=self.format) as writer:
-            for piece in counted(recording.pieces(cut), self.out.name):
+            for piece in events_counted(recording.pieces(cut), self.out.name):
                 writer.write(piece)
             if not writer.events:
                 writer.write(recording.blank(cut))
@@ -185,7 +185,7 @@ class InfoCommand:
     def run(self) -> None:
         """Read the file once and print."""
         recording = self.reading.open(self.file, "salvage")
-        summary = summarise(counted(recording.pieces(), self.file.name))
+        summary = summarise(events_counted(recording.pieces(), self.file.name))
         found = describe(self.file.stat().st_size, recording.report, summary)
         print(json.dumps(found) if self.json else to_text(str(self.file), found))
 
@@ -367,10 +367,10 @@ def write_preview(recording: Recording, cut: CropOptions, out: Path, look: Previ
     """Write the preview of a recording and return the size of the file, bytes."""
     from evnlos.report.pictures import save_animation, save_png, strip
 
-    summary = summarise(counted(recording.pieces(cut), out.name))
+    summary = summarise(events_counted(recording.pieces(cut), out.name))
     if not summary.events:
         raise DataError(f"{recording.path}: no events to show; see evnlos info {recording.path}")
-    pieces = counted(recording.pieces(cut), out.name, summary.events)
+    pieces = events_counted(recording.pieces(cut), out.name, summary.events)
     pictures = preview_images(pieces, summary, look)
     if out.suffix.lower() == ".gif":
         save_animation(out, pictures, _RATE_HZ)

@@ -152,7 +152,7 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
             recorded += (_import(study, corrected, place, progress),)
         made = _simulate(study, arm, place, progress)
         if arm.pretraining and arm.pretraining.drawn:  # before several trainings want them
-            drawn_targets(arm.sampling.setup, place.workers)
+            drawn_targets(arm.sampling.setup, place.workers, progress)
         for modality in study.modalities:
             learned = recorded[: 1 + as_modality(modality).needs_events]
             learned = (augmented(recorded[0], modality, progress),) if arm.augment else learned

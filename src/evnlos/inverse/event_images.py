@@ -121,7 +121,7 @@ class EventErrors:
         if len(others) < _FEWEST:
             return statistic
         errors = ScoreErrors.of(others, self.information.double().numpy(), 1.0)
-        return counted(statistic, errors)
+        return with_errors(statistic, errors)
 
     def gain_db(
         self, statistics: Sequence[EventStatistic], prior: PatternPrior, truths: Sequence[NDArray[np.floating]]
@@ -144,7 +144,7 @@ class EventErrors:
         return float(np.mean(gains))
 
 
-def counted(statistic: EventStatistic, errors: ScoreErrors) -> EventStatistic:
+def with_errors(statistic: EventStatistic, errors: ScoreErrors) -> EventStatistic:
     """Return what events say once the errors of their setup count: the mean taken away, the scatter as noise.
 
     Args:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,11 +26,11 @@ from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Sampling, Simulation
 from evnlos.data.pool import run_in_order
 from evnlos.errors import ConfigError
-from evnlos.inverse.event_images import counted, event_errors, event_prior
+from evnlos.inverse.event_images import event_errors, event_prior, with_errors
 from evnlos.inverse.prior import ScoreErrors
 from evnlos.inverse.sequence_light import EVENT_PRIORS
 from evnlos.inverse.sequence_statistic import EventStatistic
-from evnlos.machine import note
+from evnlos.machine import Progress, counted, silent
 from evnlos.models.confidence import on_canvas
 from evnlos.scene import TRAIN_WRITERS, Glyphs, HandwritingGlyphs
 from evnlos.setups import TRAINING_FILE, load_setup
@@ -159,7 +160,7 @@ DRAWN = TensorFile(
 """Drawn targets on disk."""
 
 
-def drawn_targets(setup: str | Path, workers: int = 1) -> DrawnTargets:
+def drawn_targets(setup: str | Path, workers: int = 1, progress: Progress = silent) -> DrawnTargets:
     """Return the targets to learn from behind a setup; where they are missing they are drawn and kept there.
 
     They are those of its `training.yaml`: half letters and digits of many writers, half the known targets drawn
@@ -168,6 +169,7 @@ def drawn_targets(setup: str | Path, workers: int = 1) -> DrawnTargets:
     Args:
         setup: Folder of `evnlos calibrate`.
         workers: Processes that draw; 0 is one for each core.
+        progress: Called with the number of targets that are drawn.
 
     Raises:
         ConfigError: The folder says nothing of what to learn from.
@@ -193,11 +195,11 @@ def drawn_targets(setup: str | Path, workers: int = 1) -> DrawnTargets:
         found = DRAWN.load(path, "")
         if found.about.glyphs == key:
             return found
-    note("draw targets")
     names = glyphs.objects()
     tasks = [names[k : k + _AT_ONCE] for k in range(0, len(names), _AT_ONCE)]
     parts = run_in_order(partial(masks_of, glyphs, simulation.seed), tasks, workers)
-    masks, sizes = zip(*(pair for part in parts for pair in part), strict=True)
+    pairs = counted(chain.from_iterable(parts), progress, "draw targets", len(names), "targets")
+    masks, sizes = zip(*pairs, strict=True)
     found = DrawnTargets(AboutDrawn(key, float(sizes[0])), torch.from_numpy(np.stack(masks)).half())
     with suppress(OSError):  # where nothing can be kept they are drawn anew each time
         DRAWN.write(path, {"masks": found.masks}, found.about)
@@ -332,7 +334,7 @@ class DrawnEvents:
         told = EventStatistic(np.zeros(len(a)), a, np.eye(len(a)))  # of each score alone: solving is linear
         if sampling.surface == "corrected":  # which has lost what all share
             errors = replace(errors, mean=np.zeros(len(a)))
-            told = counted(told, errors)
+            told = with_errors(told, errors)
         self._errors, self._information = errors, torch.from_numpy(a)
         self._back = torch.from_numpy(told.solutions(EVENT_PRIORS))  # [n, k, k]
         spot = torch.zeros(grid.side, grid.side)

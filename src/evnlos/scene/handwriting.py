@@ -35,17 +35,22 @@ def signed_distance(mask: NDArray[np.float32], reach: int) -> NDArray[np.float32
         >>> signed_distance(np.array([[0, 0, 1, 1, 0]]), 3)
         array([[ 1.5,  0.5, -0.5, -0.5,  0.5]], dtype=float32)
     """
+    inside = np.asarray(mask) >= 0.5
+    out = np.full(inside.shape, reach - 0.5, np.float32)
+    if inside.any():
+        near = tuple(slice(max(0, one.min() - reach), one.max() + reach + 1) for one in inside.nonzero())
+        part = inside[near]
+        out[near] = np.where(part, 0.5 - _distance_to(~part, reach), _distance_to(part, reach) - 0.5)
+    return out
+
+
+def _distance_to(chosen: NDArray[np.bool_], reach: int) -> NDArray[np.float64]:
+    """Return the distance of each pixel to the nearest one that is chosen, at most `reach`."""
     from scipy.ndimage import distance_transform_edt  # scipy loads slowly
 
-    def distance_to(chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-        return (
-            np.minimum(np.asarray(distance_transform_edt(~chosen)), reach)
-            if chosen.any()
-            else np.full(chosen.shape, float(reach))
-        )
-
-    inside = np.asarray(mask) >= 0.5
-    return np.where(inside, 0.5 - distance_to(~inside), distance_to(inside) - 0.5).astype(np.float32)
+    if not chosen.any():
+        return np.full(chosen.shape, float(reach))
+    return np.minimum(np.asarray(distance_transform_edt(~chosen)), reach)
 
 
 def pen_width(mask: NDArray[np.float32]) -> float:
@@ -63,9 +68,13 @@ def pen_width(mask: NDArray[np.float32]) -> float:
 
 def pen_px(ink: NDArray[np.float32]) -> float:
     """Return the mean width of the strokes, pixels: four times the mean distance of the ink to its edge."""
-    distance = signed_distance(ink, reach=40)
-    inside = distance < 0
-    return 4.0 * float(-distance[inside].mean()) if inside.any() else 1.0
+    inside = np.asarray(ink) >= 0.5
+    if not inside.any():
+        return 1.0
+    # No pixel of the ink is nearer to the ground than one beside the ink's box.
+    near = tuple(slice(max(0, one.min() - 1), one.max() + 2) for one in inside.nonzero())
+    distance = (_distance_to(~inside[near], reach=40) - 0.5).astype(np.float32)
+    return 4.0 * float(distance[inside[near]].mean())
 
 
 def ink_box(ink: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -325,7 +334,8 @@ def _deform(
     from_y = inverse[1, 0] * x + inverse[1, 1] * y
     # The bend lives on the base glyph's own square, so it is the same at every size.
     bend_x, bend_y = _bend(waves, from_x / side + 0.5, from_y / side + 0.5)
-    return _sample(base, from_x + side * bend_x + (side - 1) / 2, from_y + side * bend_y + (side - 1) / 2)
+    x, y = from_x + side * bend_x + (side - 1) / 2, from_y + side * bend_y + (side - 1) / 2
+    return _sample(base[None], x, y)[0]
 
 
 def _bend(waves: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> tuple:
@@ -336,21 +346,23 @@ def _bend(waves: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.floa
     table = np.einsum("cji,jy,ix->cyx", waves, cosine, cosine)  # [2, 65, 65]
     column = np.clip(u * 64, 0, 64)
     row = np.clip(v * 64, 0, 64)
-    return _sample(table[0], column, row), _sample(table[1], column, row)
+    return _sample(table, column, row)
 
 
-def _sample(image: NDArray, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray:
-    """Return `image` at columns `x` and rows `y`, bilinear, zero outside."""
-    padded = np.pad(image, 1)
-    height, width = padded.shape
+def _sample(images: NDArray, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray, ...]:
+    """Return `images` [N, H, W] at columns `x` and rows `y`, bilinear, zero outside."""
+    padded = np.pad(images, ((0, 0), (1, 1), (1, 1)))
+    height, width = padded.shape[1:]
     x = np.clip(x + 1, 0, width - 1.001)
     y = np.clip(y + 1, 0, height - 1.001)
     column, row = x.astype(np.intp), y.astype(np.intp)
     right, below = (x - column).astype(np.float32), (y - row).astype(np.float32)
-    flat, start = padded.ravel(), row * width + column
-    upper = flat[start] * (1 - right) + flat[start + 1] * right
-    lower = flat[start + width] * (1 - right) + flat[start + width + 1] * right
-    return upper * (1 - below) + lower * below
+    start, found = row * width + column, []
+    for flat in padded.reshape(len(padded), -1):
+        upper = flat[start] * (1 - right) + flat[start + 1] * right
+        lower = flat[start + width] * (1 - right) + flat[start + width + 1] * right
+        found.append(upper * (1 - below) + lower * below)
+    return tuple(found)
 
 
 def _waves(rng: np.random.Generator, amplitude: float) -> NDArray[np.float64]:

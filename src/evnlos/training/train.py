@@ -125,7 +125,7 @@ def train(
             f"mirror is on, and a reconstructor of kind {network.kind!r} sees whole sequences, which are not "
             "mirrored; leave it off"
         )
-    _check_drawn(network, settings, captures)
+    _check_drawn(network, settings, captures, progress)
     samples = None
     if not (isinstance(dataset, LiveDataset) or (out / "weights.safetensors").is_file()):
         samples = NlosDataset(dataset, "train", network.modality)
@@ -273,7 +273,9 @@ def _network(settings: Training, start: Weights | None, sampling: Sampling) -> t
     return start.network, replace(settings, network=start.network.settings, modality=start.modality.name)
 
 
-def _check_drawn(network: Reconstructor, settings: Training, captures: Dataset | None) -> None:
+def _check_drawn(
+    network: Reconstructor, settings: Training, captures: Dataset | None, progress: Progress
+) -> None:
     """Refuse drawn sequences where nobody knows how to draw them; draw the targets where they are missing."""
     if captures is not None and not settings.drawn:
         raise ConfigError(
@@ -291,7 +293,7 @@ def _check_drawn(network: Reconstructor, settings: Training, captures: Dataset |
             "are solved; leave --drawn at 0"
         )
     if settings.drawn:
-        drawn_targets(network.sampling.setup)
+        drawn_targets(network.sampling.setup, progress=progress)
 
 
 def _check_data(dataset: Dataset, network: Reconstructor) -> None:
