@@ -446,14 +446,18 @@ def test_a_network_learns_from_drawn_sequences(solved, tmp_path, monkeypatch) ->
     plan = replace(PLAN, network=SOLVING, epochs=2, drawn=48)
     with pytest.raises(ConfigError, match=r"has no training\.yaml"):
         train(dataset, plan, tmp_path / "none")
-    monkeypatch.setattr("evnlos.models.drawn._DRAWN", 16)
+    monkeypatch.setattr("evnlos.models.drawn.TRAIN_WRITERS", 3)
+    monkeypatch.setattr("evnlos.models.drawn._POPULATIONS", 2)
     training = Simulation(glyphs=HandwritingGlyphs(characters="BCEFHLT", writers=2), setup=RadiometricSetup())
     folder = Path(dataset.sampling.setup).parent
     save_yaml(to_dict(training), folder / "training.yaml")
     try:
-        whole = train(dataset, plan, tmp_path / "whole", captures=dataset)
+        steps = list[Step]()
+        whole = train(dataset, plan, tmp_path / "whole", progress=steps.append, captures=dataset)
         targets = DRAWN.load(folder / "drawn.safetensors", "")
-        assert targets.masks.shape == (21, 64, 64) and targets.about.size_m == 0.08  # 3 writers, 7 letters
+        assert targets.masks.shape == (42, 64, 64) and targets.about.size_m == 0.08  # 2 x 3 writers, 7 letters
+        assert len(torch.unique(targets.masks.flatten(1), dim=0)) == 42
+        assert [step.done for step in steps if step.unit == "targets"] == list(range(43))
         assert evaluate(whole.load(), dataset, "train").scores.mean()["psnr_db"] > 12
 
         def stop(step: Step) -> None:

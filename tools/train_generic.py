@@ -235,7 +235,7 @@ def trained(modality: str, files: list[Path], start: str, steps: int, progress: 
     assert isinstance(network, SequenceReconstructor)
     if start:
         network.take_layers(load_weights(layers_of(start, modality)[0]).network)
-    masks = torch.from_numpy(np.stack([mask for mask, _ in masks_of(_LETTERS, 0, _LETTERS.objects())])).half()
+    masks = torch.from_numpy(np.stack([mask for mask, _ in masks_of(_LETTERS, (0, _LETTERS.objects()))])).half()
     held_out = files[::_HELD_OUT] if len(files) > _HELD_OUT else files
     learned = [file for file in files if file not in held_out] or files
     walls, others = (Walls(some, modality, masks, network) for some in (learned, held_out))

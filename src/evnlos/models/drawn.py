@@ -7,12 +7,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,8 +33,8 @@ from evnlos.machine import Progress, counted, silent
 from evnlos.models.confidence import on_canvas
 from evnlos.scene import TRAIN_WRITERS, Glyphs, HandwritingGlyphs
 from evnlos.setups import TRAINING_FILE, load_setup
-from evnlos.tensor_file import TensorFile, file_checksum
-from evnlos.types import Plane, target_side_m
+from evnlos.tensor_file import TensorFile
+from evnlos.types import Plane, derive_seed, target_side_m
 
 if TYPE_CHECKING:
     from evnlos.models.sequence import PooledFrames
@@ -125,9 +124,9 @@ class TargetGrid:
 DRAWN_FILE = "drawn.safetensors"
 """Targets that were drawn for the training behind a setup, in its folder."""
 
-_DRAWN = 1024  # targets: more take long to draw, and what is bent anew is as good as new
+_POPULATIONS = 4  # of writers: what is bent anew is not as good as new, and more take long to draw
 _SIDE, _AT_ONCE, _COUNT = 64, 32, 8  # pixels of one; drawn at a time; subsets of the time steps
-_TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.04, 0.035, 0.025, 0.06, 0.008, 0.015
+_TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.08, 0.07, 0.05, 0.12, 0.016, 0.03
 _WAVES = 5  # knots along a side of the field that bends
 
 
@@ -163,8 +162,9 @@ DRAWN = TensorFile(
 def drawn_targets(setup: str | Path, workers: int = 1, progress: Progress = silent) -> DrawnTargets:
     """Return the targets to learn from behind a setup; where they are missing they are drawn and kept there.
 
-    They are those of its `training.yaml`: half letters and digits of many writers, half the known targets drawn
-    again, a thousand in all.
+    They are those of its `training.yaml`, letters and digits of many writers, by all writers for training of
+    four populations: five and a half thousand. No known target is among them, so that captures of it tell how
+    well what was learned holds.
 
     Args:
         setup: Folder of `evnlos calibrate`.
@@ -181,24 +181,21 @@ def drawn_targets(setup: str | Path, workers: int = 1, progress: Progress = sile
             "with --sampling.setup FOLDER of `evnlos calibrate`, or leave --drawn at 0"
         )
     simulation = load_yaml(Simulation, folder / TRAINING_FILE)
-    glyphs, images = simulation.glyphs, list[str]()
+    glyphs, seeds = simulation.glyphs, [simulation.seed]
     if isinstance(glyphs, HandwritingGlyphs):
-        shown = sorted(Path(glyphs.known).glob("*.png")) if glyphs.redrawn else []
-        half = _DRAWN // 2 if shown else _DRAWN
-        again = math.ceil(half / len(shown)) if shown else 0
-        writers = min(math.ceil(half / len(glyphs.characters)), max(1, TRAIN_WRITERS - glyphs.first_writer))
-        glyphs = replace(glyphs, writers=writers, redrawn=again)
-        images = [file_checksum(one) for one in shown]
-    key = config_hash(to_dict(glyphs) | {"seed": simulation.seed, "images": images})
+        glyphs = replace(glyphs, first_writer=0, writers=TRAIN_WRITERS, known="", redrawn=0)
+        seeds = [derive_seed(simulation.seed, "population", number) for number in range(_POPULATIONS)]
+    key = config_hash(to_dict(glyphs) | {"seeds": seeds})
     path = folder / DRAWN_FILE
     if path.is_file():
         found = DRAWN.load(path, "")
         if found.about.glyphs == key:
             return found
     names = glyphs.objects()
-    tasks = [names[k : k + _AT_ONCE] for k in range(0, len(names), _AT_ONCE)]
-    parts = run_in_order(partial(masks_of, glyphs, simulation.seed), tasks, workers)
-    pairs = counted(chain.from_iterable(parts), progress, "draw targets", len(names), "targets")
+    sheets = [names[k : k + _AT_ONCE] for k in range(0, len(names), _AT_ONCE)]
+    parts = run_in_order(partial(masks_of, glyphs), list(product(seeds, sheets)), workers)
+    total = len(seeds) * len(names)
+    pairs = counted(chain.from_iterable(parts), progress, "draw targets", total, "targets")
     masks, sizes = zip(*pairs, strict=True)
     found = DrawnTargets(AboutDrawn(key, float(sizes[0])), torch.from_numpy(np.stack(masks)).half())
     with suppress(OSError):  # where nothing can be kept they are drawn anew each time
@@ -212,8 +209,14 @@ def _folder(setup: str | Path) -> Path:
     return path.parent if path.is_file() else path
 
 
-def masks_of(glyphs: Glyphs, seed: int, names: list[str]) -> list[tuple[NDArray, float]]:
-    """Return mask and side of some targets."""
+def masks_of(glyphs: Glyphs, sheet: tuple[int, list[str]]) -> list[tuple[NDArray, float]]:
+    """Return mask and side of some targets.
+
+    Args:
+        glyphs: Their set.
+        sheet: Seed of the population, names.
+    """
+    seed, names = sheet
     found = list[tuple[NDArray, float]]()
     for name in names:
         target = glyphs.target(name, seed)
@@ -371,12 +374,12 @@ class DrawnSequences:
         grid: TargetGrid,
         parts: Sequence[Callable[[Tensor, torch.Generator], Tensor]],
     ) -> None:
-        self._planes = grid.of_target(targets.masks.float(), targets.about.size_m)
-        self._parts = parts
+        self._targets, self._grid, self._parts = targets, grid, parts
 
     def batch(self, count: int, seed: int) -> tuple[Tensor, Tensor]:
         """Return inputs [B, S, P, P] and true images [B, 1, P, P], float32; the same for the same seed."""
         generator = torch.Generator().manual_seed(seed)
-        chosen = torch.randint(len(self._planes), (count,), generator=generator)
-        planes = bent(self._planes[chosen], generator)
+        masks, size_m = self._targets.masks, self._targets.about.size_m
+        chosen = torch.randint(len(masks), (count,), generator=generator)
+        planes = bent(self._grid.of_target(masks[chosen].float(), size_m), generator)
         return torch.cat([part(planes, generator) for part in self._parts], dim=1), planes[:, None]
