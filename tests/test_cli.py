@@ -303,7 +303,9 @@ def test_the_result_is_drawn_with_and_without_what_may_be_unknown() -> None:
     assert (whole == (11, 95, 165)).all(axis=-1).any() and not (short == (11, 95, 165)).all(axis=-1).any()
 
 
-def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, tmp_path, capsys) -> None:
+def test_wrong_input_is_one_line_and_exit_code_2(
+    runs, recorded, tiny_captures, tmp_path, monkeypatch, capsys
+) -> None:
     out = tmp_path / "out"
     assert "unknown command 'zzz'; give one of demo, simulate" in fails(capsys, "zzz")
     assert "--port is 'abc'; give a whole number; see" in fails(capsys, "app", "--port", "abc")
@@ -322,6 +324,8 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
         told = fails(capsys, *command, "--out", out, flag, "nope")
         assert f"Unrecognized options: {flag}, nope; Perhaps you meant: {flag}." in told and len(told) < 240
         assert told.count("--") == 5 and " or others; see evnlos" in told  # that one, three, --help
+    (tmp_path / "w.npz").touch()
+    monkeypatch.chdir(tmp_path)
     told = fails(capsys, "track", "c", "--targets", "nope")
     assert "--targets is 'nope'; give a whole number or auto; see" in told
     for words, said in (
@@ -330,6 +334,8 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
             "SequenceAnalysisSettings.positions is -1; give 1 or more",
         ),
         (("identify", "--sequence.other-noises", "0"), "other_noises is (0.0,); give positive numbers"),
+        (("invert", "w.npz", "--noise-sigma", "-1"), "--noise-sigma is -1; give 1e-12 or more"),
+        (("invert", "w.npz", "--background-degree", "-1"), "--background-degree is -1; give 0 or more"),
         (("fetch", "captures", "--most-gb", "-1"), "--most-gb is -1; give more than 0 and at most 1e+06"),
     ):
         assert said in fails(capsys, *words)
