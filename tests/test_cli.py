@@ -283,6 +283,10 @@ def test_one_image_of_a_whole_recording_is_shown_once(tiny_captures, tmp_path, c
     told = json.loads((tmp_path / "r" / "summary.json").read_text())
     assert told["one_picture"] and any("one image" in line for line in told["in_words"])
     assert "confidence" in told or told["no_confidence"] in told["in_words"]
+    positions = [path.name for path in (tmp_path / "r").glob("position_*.png")]
+    assert len(positions) == 1 < told["positions"]  # it stood there once for each, moved along the stated path
+    with Image.open(tmp_path / "r" / positions[0]) as one, Image.open(tmp_path / "r" / "strip.png") as row:
+        assert row.width <= 2 * one.width
     with Image.open(tmp_path / "r" / "result.png") as sheet:
         assert sheet.width > 900 and sheet.height > 400
         dark = np.asarray(sheet.convert("L")) < 60
