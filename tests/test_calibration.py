@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,9 +43,9 @@ from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
 from evnlos.data import SensorSize, Simulation, load_pattern, read_capture, simulate_object
 from evnlos.data.lab import Lab, render_captures
-from evnlos.errors import ConfigError, DataError, UnknownNameError
+from evnlos.errors import ConfigError, DataError, EvnlosError, MissingDependencyError, UnknownNameError
 from evnlos.inverse import FrameTerm, handwritten_prior, sequence_light
-from evnlos.scene import FontGlyphs, pen_width
+from evnlos.scene import FontGlyphs, find_font, pen_width
 from evnlos.setups import PaperSetup, RadiometricSetup, load_setup
 from evnlos.types import Events, Plane
 
@@ -241,6 +242,18 @@ def test_calibrate_refuses_before_it_reads(copies, tmp_path) -> None:
     with pytest.raises(DataError, match=r"0 capture\(s\) are left"):
         evnlos.calibrate([], tmp_path / "none")
     assert not (tmp_path / "none").exists()
+
+
+def test_calibrate_without_fonts_says_what_to_install_before_it_reads(copies, tmp_path, monkeypatch) -> None:
+    """The fit was lost: a font was missed at its end, when the wall is asked what it shows of handwriting."""
+    (copies[0] / "capture.yaml").write_text("no: [capture")
+    with pytest.raises(EvnlosError, match=r"capture\.yaml"):
+        evnlos.calibrate(copies, tmp_path / "out")
+    fonts = sys.modules[find_font.__module__]
+    monkeypatch.setattr(fonts, "installed_fonts", tuple)
+    with pytest.raises(MissingDependencyError, match=r"fonts are missing \(.*\); pip install evnlos\[fonts\]$"):
+        evnlos.calibrate(copies, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_excluded_captures_are_not_even_read(copies) -> None:

@@ -283,6 +283,10 @@ def test_one_image_of_a_whole_recording_is_shown_once(tiny_captures, tmp_path, c
     told = json.loads((tmp_path / "r" / "summary.json").read_text())
     assert told["one_picture"] and any("one image" in line for line in told["in_words"])
     assert "confidence" in told or told["no_confidence"] in told["in_words"]
+    positions = [path.name for path in (tmp_path / "r").glob("position_*.png")]
+    assert len(positions) == 1 < told["positions"]  # it stood there once for each, moved along the stated path
+    with Image.open(tmp_path / "r" / positions[0]) as one, Image.open(tmp_path / "r" / "strip.png") as row:
+        assert row.width <= 2 * one.width
     with Image.open(tmp_path / "r" / "result.png") as sheet:
         assert sheet.width > 900 and sheet.height > 400
         dark = np.asarray(sheet.convert("L")) < 60
@@ -303,11 +307,13 @@ def test_the_result_is_drawn_with_and_without_what_may_be_unknown() -> None:
     assert (whole == (11, 95, 165)).all(axis=-1).any() and not (short == (11, 95, 165)).all(axis=-1).any()
 
 
-def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, tmp_path, capsys) -> None:
+def test_wrong_input_is_one_line_and_exit_code_2(
+    runs, recorded, tiny_captures, tmp_path, monkeypatch, capsys
+) -> None:
     out = tmp_path / "out"
     assert "unknown command 'zzz'; give one of demo, simulate" in fails(capsys, "zzz")
     assert "--port is 'abc'; give a whole number; see" in fails(capsys, "app", "--port", "abc")
-    assert "--fps is 'x'; give NUMBER; see" in fails(capsys, "events", "v.mp4", "--fps", "x", "--out", "e.h5")
+    assert "--fps is 'x'; give a number; see" in fails(capsys, "events", "v.mp4", "--fps", "x", "--out", "e.h5")
     assert "--changing is '1'; give NUMBER NUMBER; see" in fails(capsys, "invert", "c", "--changing", "1")
     assert "--pressset, near; perhaps you meant --set; see" in fails(capsys, "lab", "--pressset", "near")
     assert "Unrecognized options: --prot, 3; Perhaps you meant: --port INT" in fails(
@@ -322,7 +328,21 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
         told = fails(capsys, *command, "--out", out, flag, "nope")
         assert f"Unrecognized options: {flag}, nope; Perhaps you meant: {flag}." in told and len(told) < 240
         assert told.count("--") == 5 and " or others; see evnlos" in told  # that one, three, --help
-    assert "--targets is 'nope'; give INT or auto; see" in fails(capsys, "track", "c", "--targets", "nope")
+    (tmp_path / "w.npz").touch()
+    monkeypatch.chdir(tmp_path)
+    told = fails(capsys, "track", "c", "--targets", "nope")
+    assert "--targets is 'nope'; give a whole number or auto; see" in told
+    for words, said in (
+        (
+            ("identify", "--sequence.positions", "-1"),
+            "SequenceAnalysisSettings.positions is -1; give 1 or more",
+        ),
+        (("identify", "--sequence.other-noises", "0"), "other_noises is (0.0,); give positive numbers"),
+        (("invert", "w.npz", "--noise-sigma", "-1"), "--noise-sigma is -1; give 1e-12 or more"),
+        (("invert", "w.npz", "--background-degree", "-1"), "--background-degree is -1; give 0 or more"),
+        (("fetch", "captures", "--most-gb", "-1"), "--most-gb is -1; give more than 0 and at most 1e+06"),
+    ):
+        assert said in fails(capsys, *words)
     told = fails(capsys, "lab", "--out", out, "--set", "nope")
     assert "--set is 'nope'; give one of 'near', 'far'; see" in told or "'far', 'near'; see" in told
     assert "no modality of kind 'x'; give one of frame, event, fusion" in fails(
@@ -347,7 +367,7 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
     assert "vgg" in fails(
         capsys, "evaluate", "--weights", runs["e2e-frame"], "--data", recorded, "--vgg", tmp_path / "vgg.pth"
     )
-    assert "pitch_m" in fails(capsys, "import", *tiny_captures, "--out", out, "--sampling.pitch-m", "nan")
+    assert "pitch_m" in fails(capsys, "import", *tiny_captures, "--out", out, "--sampling.pitch-m", "-1")
     assert not out.exists()
 
 

@@ -107,6 +107,40 @@ def test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows(encoding
         assert done.stderr == f"evnlos app: error: {said}; see evnlos app --help\n"
 
 
+_NUMBERS = re.compile(r"^ *│? *(--[a-z][\w.-]*) ((?:\{None\}\||\[|\{)*(?:STR )?(?:FLOAT|INT).*?)(?:  |$)", re.M)
+"""An option of numbers in the help, and what its words are."""
+_ITS_FIRST_WORD = {
+    "capture": "check",
+    "experiment": "captures",
+    "fetch": "captures",
+    "pixel": "fit",
+    "scan": "plan",
+}
+_NEEDED = {"--data": ("evaluate", "finetune", "report"), "--weights": ("evaluate", "finetune")}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_number_that_is_none_is_told_with_its_flag_and_the_cure(verb: str, monkeypatch, capsys) -> None:
+    """`--fps nan` was told "fps is nan; its size has to be 1e-30 to 1e+30"; others showed types of Python."""
+    monkeypatch.setenv("COLUMNS", "400")
+    with contextlib.suppress(SystemExit):
+        main([verb, "--help"])
+    page = capsys.readouterr().out
+    rest = [_ITS_FIRST_WORD[verb]] if verb in _ITS_FIRST_WORD else []
+    rest += ["x"] * (len(re.findall(r" [A-Z]\w+", page.splitlines()[0])) if verb != "experiment" else 0)
+    rest += [word for flag, verbs in _NEEDED.items() if verb in verbs for word in (flag, "x")]
+    for k, (kind, flag) in enumerate({kind: flag for flag, kind in _NUMBERS.findall(page)}.items()):
+        wrong = ("nan", "-inf", "1e400")[k % 3]
+        count = 2 if "[" in kind else len(re.findall(r"FLOAT|INT", kind))
+        with pytest.raises(SystemExit) as end:
+            main([verb, *rest, flag, *["one"] * ("STR" in kind), *[wrong] * count])
+        told = capsys.readouterr().err
+        assert end.value.code == 2 and told.count("\n") == 1
+        assert re.search(rf"{flag} is '.*; give .*(number|NUMBER|INT)", told), told
+        assert "INT" in kind or "finite" in told, told
+        assert not re.search("Error parsing|typing|tuple|FLOAT", told), told
+
+
 def test_json_is_one_object(recording, tmp_path, capsys) -> None:
     def printed(*words: object) -> dict:
         capsys.readouterr()

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import evnlos
 import evnlos.types
 from evnlos.cli import VERBS
 from evnlos.cli.about import script
 from evnlos.models import RECONSTRUCTORS
+from evnlos.setups import ROOMS
 
 SOURCE = Path(evnlos.__file__).parent
 ROOT = SOURCE.parent.parent
@@ -157,3 +159,14 @@ def test_no_page_to_start_with_asks_for_a_compiler() -> None:
     for page in (ROOT / "README.md", *(DOCS / f"{name}.md" for name in ("install", "tour", "quickstart"))):
         assert not re.search(r"\bgcc\b|\bclang\b|build-essential", page.read_text()), page.name
     assert "no compiler" in (DOCS / "install.md").read_text()
+
+
+def test_the_figure_of_rooms_shows_the_table_of_its_page() -> None:
+    """A table that is renewed needs its figure drawn anew: python tools/draw_results.py walls."""
+    draw_results = pytest.importorskip("draw_results", reason="needs the extra `plot`")
+    rows = draw_results.rows_of_rooms((ROOT / "docs" / "walls.md").read_text(encoding="utf-8"))
+    assert len(rows) == 3 * len(ROOMS) and {room for room, _ in rows} == set(ROOMS)
+    for e2e, _, epnp, lead, low, high in rows.values():
+        assert low <= lead <= high and lead == pytest.approx(epnp - e2e, abs=0.02)
+    with Image.open(ROOT / "docs" / "figures" / "walls.png") as figure:
+        assert figure.info["Description"] == draw_results.digest_of(rows)

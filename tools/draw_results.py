@@ -1,11 +1,14 @@
 """Draw what the pages on results show: the table from its records, a film of learned results, a fine-tuning.
 
 python tools/draw_results.py                                        # docs/figures/results_near.png
+python tools/draw_results.py walls                                  # docs/figures/walls.png
 python tools/draw_results.py film                                   # docs/figures/learned_film.webp
 python tools/draw_results.py finetune mine near-frame mine-frame    # docs/figures/finetune.png
 """
 
+import hashlib
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -27,6 +30,8 @@ METHODS = {
     "EPNP, sequence": "joint/near-test-epnp-joint",
     "EPNP, sequence + consistency": "joint/near-test-epnp-joint-consistency",
 }
+SEES = {"frames": "frame", "events": "event", "fusion": "fusion"}
+WALLS = ROOT / "docs" / "walls.md"
 COLOURS = {"frame": "#0072b2", "event": "#d55e00", "fusion": "#009e73"}
 
 
@@ -105,6 +110,8 @@ def main() -> None:
     match sys.argv[1:]:
         case []:
             draw_table()
+        case ["walls"]:
+            draw_walls()
         case ["film"]:
             draw_film()
         case ["finetune", data, before, after]:
@@ -135,6 +142,54 @@ def draw_table() -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="x", alpha=0.25)
     figure.savefig(ROOT / "docs" / "figures" / "results_near.png", dpi=110)
+
+
+def rows_of_rooms(page: str) -> dict[tuple[str, str], list[float]]:
+    """Return E2E, simulation only, EPNP, its lead and the ends of its interval, dB, by room and modality.
+
+    Args:
+        page: Text of the page on walls; the rows of its table of all rooms count.
+    """
+    room, found = "", dict[tuple[str, str], list[float]]()
+    for line in page.splitlines():
+        cells = [cell.strip(" `") for cell in line.strip("|").split("|")]
+        if len(cells) == 8 and cells[1] in SEES and cells[-1].endswith("]"):
+            room = cells[0] or room
+            values = re.findall(r"[+-]?[0-9.]+", " ".join(cells[4:]))
+            found[room, SEES[cells[1]]] = [float(value) for value in values]
+    return found
+
+
+def digest_of(rows: dict[tuple[str, str], list[float]]) -> str:
+    """Return what tells whether a figure shows these rows."""
+    return hashlib.sha256(repr(sorted(rows.items())).encode()).hexdigest()[:16]
+
+
+def draw_walls() -> None:
+    """Draw PSNR of the three networks of each room, and the lead of EPNP with its 95 % interval."""
+    rows = rows_of_rooms(WALLS.read_text(encoding="utf-8"))
+    rooms = list(dict.fromkeys(room for room, _ in rows))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 6), sharey=True, layout="constrained")
+    for (room, modality), (e2e, simulated, epnp, lead, low, high) in rows.items():
+        y = -rooms.index(room) - 0.25 * (list(COLOURS).index(modality) - 1)
+        colour, is_first = COLOURS[modality], room == rooms[0]
+        left.plot([e2e, epnp], [y, y], "-", color=colour, alpha=0.3, lw=1.5)
+        for value, mark, name in ((e2e, "|", "E2E"), (simulated, ".", "simulation only"), (epnp, "o", "EPNP")):
+            label = name if is_first and modality == "frame" else None
+            left.plot(value, y, mark, color=colour, ms=9 if mark == "|" else 5, label=label)
+        bar = [[lead - low], [high - lead]]
+        label = modality if is_first else None
+        right.errorbar(lead, y, xerr=bar, fmt="o", color=colour, ms=4, capsize=2, lw=1, label=label)
+    right.axvline(0, color="#888888", ls="--", lw=1)
+    left.set_yticks(-np.arange(len(rooms)), rooms)
+    left.set_xlabel("PSNR, dB (mean of four held-out characters)")
+    right.set_xlabel("EPNP less the strongest E2E, dB (95 % interval)")
+    for axes in (left, right):
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="x", alpha=0.25)
+    told = {"Description": digest_of(rows), "Software": None}
+    figure.savefig(ROOT / "docs" / "figures" / "walls.png", dpi=110, metadata=told)
 
 
 if __name__ == "__main__":

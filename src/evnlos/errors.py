@@ -60,7 +60,7 @@ class PlainOutput:
         return getattr(self._stream, name)
 
 
-_OF_PYTHON = re.compile(r'(?:\b\w+=(?:"\w+"|\w+)?(?: and)? )+\(((?:--|evnlos )[^()]*)\)')
+_OF_PYTHON = re.compile(r'(?:\b\w+=(?:"\w+"|\w+(?:\([^()]*\))?)?(?: and)? )+\(((?:--|evnlos )[^()]*)\)')
 
 
 def for_command_line(text: object) -> str:

@@ -80,6 +80,12 @@ class SequenceAnalysisSettings:
         for name in ("travel_m", "speed_m_s", "crossing_noise", "target_size_m"):
             if not 0 < (value := getattr(self, name)) < math.inf:
                 raise ConfigError(f"SequenceAnalysisSettings.{name} is {value}; give a positive number")
+        for name in ("positions", "coefficients", "writers"):
+            if (value := getattr(self, name)) < 1:
+                raise ConfigError(f"SequenceAnalysisSettings.{name} is {value}; give 1 or more")
+        noises = self.other_noises
+        if not all(0 < value < math.inf for value in noises):
+            raise ConfigError(f"SequenceAnalysisSettings.other_noises is {noises}; give positive numbers")
         wrong = [count for count in self.counts if not 1 <= count <= self.positions]
         if wrong or not self.counts:
             raise ConfigError(

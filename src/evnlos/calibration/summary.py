@@ -22,11 +22,12 @@ from evnlos.config import save_yaml
 from evnlos.data import captures_in, randomized
 from evnlos.data.fixed_pattern import PATTERN_FILE, save_pattern
 from evnlos.data.simulate import Simulation
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, MissingDependencyError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, silent
 from evnlos.registry import __version__
-from evnlos.scene import HandwritingGlyphs
+from evnlos.scene import HandwritingGlyphs, find_font
+from evnlos.scene.handwriting import FACES
 from evnlos.setups import CALIBRATED_FILE, TRAINING_FILE
 from evnlos.types import aligned
 
@@ -288,6 +289,8 @@ def calibrate(
     Raises:
         ConfigError: The folder is a file or holds a setup, or something is measured that the fit has no number
             for; nothing is read then.
+        MissingDependencyError: A font of the handwriting for which the fitted wall is judged is missing;
+            nothing is read then.
         DataError: As for `fit_setup`, and as for `write_setup`.
     """
     settings = Calibration() if settings is None else settings
@@ -296,6 +299,7 @@ def calibrate(
         check_out(Path(out), force)
     if any(path.is_dir() for path in folders):
         captures_in(folders)  # a folder that is no capture is named, not counted
+    _check_fonts()
     fit = fit_setup(folders, settings, progress)
     if look is not None:
         look(fit)
@@ -305,6 +309,19 @@ def calibrate(
         if fit.pixel is not None and fit.known:
             write_event_errors(path.parent, folders, fit.captures, progress, workers)
     return fit
+
+
+def _check_fonts() -> None:
+    """Refuse before the work where its last question, what the wall shows of handwriting, cannot be asked."""
+    try:
+        lacking = next((name for name in FACES["both"] if find_font(name).note), "")
+    except (MissingDependencyError, UnknownNameError) as error:
+        lacking = str(error).partition(";")[0]
+    if lacking:
+        cure = "pip install evnlos[fonts]"
+        raise MissingDependencyError(
+            f"the wall is judged for handwriting, whose fonts are missing ({lacking}); {cure}"
+        )
 
 
 def check_out(out: Path, force: bool) -> None:

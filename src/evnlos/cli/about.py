@@ -222,6 +222,9 @@ _HERE = {
 }
 
 
+_MOST_GB = 1e6  # of one file
+
+
 @dataclass(frozen=True)
 class FetchCommand:
     """Get published captures, weights or examples: each file is checked against its listed SHA-256."""
@@ -249,6 +252,10 @@ class FetchCommand:
         from evnlos.files import fetch_file, has_digest
         from evnlos.machine import ProgressBars, Step
 
+        if not 0 < self.most_gb <= _MOST_GB:
+            raise ConfigError(
+                f"--most-gb is {self.most_gb:g}; give more than 0 and at most {_MOST_GB:g} (gigabytes)"
+            )
         address, listed = self._reached()
         wanted = {
             name: digest

@@ -34,6 +34,10 @@ _EXPLAINED = 2.0  # times the camera's noise that frames may keep
 _BRIGHTEST = 5.0  # by which cells of a plane may change that shines with 1
 
 
+_LEAST = dict.fromkeys(("cells", "columns"), 2) | dict.fromkeys(("subsets", "bin"), 1)
+_LEAST |= dict.fromkeys(("samples", "static", "background_degree"), 0) | {"noise_sigma": 1e-12}
+
+
 @dataclass(frozen=True)
 class InvertCommand:
     """Invert a photograph of a matte wall, or whole sequences of captures, by the operator alone."""
@@ -102,9 +106,9 @@ class InvertCommand:
 
     def run(self) -> None:
         """Invert, print the figures, write the image."""
-        for flag, least in (("cells", 2), ("columns", 2), ("subsets", 1), ("samples", 0)):
-            if (value := getattr(self, flag)) < least:
-                raise ConfigError(f"--{flag} is {value}; give {least} or more")
+        for flag, least in _LEAST.items():
+            if (value := getattr(self, flag)) is not None and value < least:
+                raise ConfigError(f"--{flag.replace('_', '-')} is {value:g}; give {least} or more")
         if self.regularization == "gcv" and self.solver != "tikhonov":
             raise ConfigError("--regularization gcv serves --solver tikhonov only; give that, or a number")
         if self.colours and (self.setup is None or self.evidence or self.changing or self.pattern):

@@ -1,8 +1,6 @@
 """From the words of a command line to its command, and notes on stderr.
 
-- Notes on stderr: how much a command says beside its result (`--log-level`, EVNLOS_LOG).
-- From the words after a verb to its command; what does not fit is one line, not the parser's box.
-- What names on a command line stand for, before the libraries of the work are there.
+What does not fit is one line, not the parser's box; names are looked up before the libraries of the work.
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ import glob
 import importlib
 import io
 import logging
+import math
 import os
 import re
 import sys
@@ -20,7 +19,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, get_origin
 
 from evnlos.errors import (
     ConfigError,
@@ -106,16 +105,14 @@ def listen(arguments: list[str]) -> list[str]:
     show_progress(shown)
     if level.lower() not in LEVELS:
         raise ConfigError(f"{source} is {level!r}; give one of {', '.join(LEVELS)}")
-    for handler in [one for one in LOG.handlers if isinstance(one, StderrHandler)]:
-        LOG.removeHandler(handler)
-    LOG.addHandler(StderrHandler())
+    LOG.handlers = [*(one for one in LOG.handlers if not isinstance(one, StderrHandler)), StderrHandler()]
     LOG.setLevel(level.upper())
     return rest
 
 
 _RULE = re.compile(r"^[\s─╰╯-]*$")
 _HELP_INDENT = 8  # columns before the text that explains an option
-_CAMERAS = ("sensor", "frame-camera", "pixel")
+_IN_SETUP = {"transport": ""} | {part: f"{part}." for part in ("sensor", "frame-camera", "pixel")}
 _RENAMED = {  # flag of an older version -> the words of today
     "--rig": ("--setup",),
     "--paradigm": ("--modality",),
@@ -134,10 +131,8 @@ _RENAMED_IN = {  # the same, of one command
 }
 _EXPERIMENTS = {"joint": "sequence", "shots": "capture-count", "carry-over": "generalization"}  # today's by old
 _MOVED = {  # beginning of the flags of a setting that moved, by command
-    "simulate": {"--transport.": "--setup."} | {f"--{part}.": f"--setup.{part}." for part in _CAMERAS},
-    "lab": {"--transport.": "--setup."} | {f"--{part}.": f"--setup.{part}." for part in _CAMERAS},
-    "calibrate": {"--start.transport.": "--start.setup."}
-    | {f"--start.{part}.": f"--start.setup.{part}." for part in _CAMERAS},
+    verb: {f"--{place}{part}.": f"--{place}setup.{now}" for part, now in _IN_SETUP.items()}
+    for verb, place in {"simulate": "", "lab": "", "calibrate": "start."}.items()
 }
 
 
@@ -183,11 +178,10 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
 
     said = io.StringIO()
     # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
-    config, rules = (tyro.conf.AvoidSubcommands, tyro.conf.HelptextFromCommentsOff), _lists()
+    how: Any = {"default": default, "config": (tyro.conf.AvoidSubcommands, tyro.conf.HelptextFromCommentsOff)}
     try:
         with contextlib.redirect_stderr(said), _unwrapped(words):
-            prog = f"evnlos {verb}"
-            found = tyro.cli(command, args=words, prog=prog, default=default, config=config, registry=rules)
+            found = tyro.cli(command, args=words, prog=f"evnlos {verb}", registry=_rules(), **how)
     except SystemExit as end:
         if not end.code:
             raise
@@ -202,36 +196,44 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
             text = f"{unknown[1]}: {verb} takes no more words without a flag; give one at a time"
         elif unknown and "Perhaps you meant" not in text:
             with contextlib.redirect_stdout(io.StringIO()) as page, contextlib.suppress(SystemExit):
-                tyro.cli(command, args=["--help"], default=default, config=config)
+                tyro.cli(command, args=["--help"], **how)
             near = difflib.get_close_matches(unknown[1], set(re.findall(r"--[\w.-]*\w", page.getvalue())), 1)
             text += "".join(f"; perhaps you meant {one}" for one in near)
         raise UnfitWordsError(f"{text}; see evnlos {verb} --help") from None
     except (ArithmeticError, MemoryError, ValueError) as error:  # of a setting that only fits together
         raise ConfigError(f"the settings do not fit together ({error}); see evnlos {verb} --help") from None
-    from evnlos.config import check_numbers  # needs packages that may be missing
-
-    check_numbers(found, "")
+    importlib.import_module("evnlos.config").check_numbers(found, "")  # needs packages that may be missing
     print(said.getvalue(), end="", file=sys.stderr)  # warnings, if there were any
     return found
 
 
-def _lists() -> Any:
-    """Return tyro's rules with one more: the default of a list of nothing is called so, and not left blank."""
+def _rules() -> Any:
+    """Return tyro's rules with more: numbers are finite, empty and wrong lists say what they are."""
     from tyro.constructors import ConstructorRegistry
 
     rules, asked = ConstructorRegistry(), list[Any]()
 
-    def named(info: Any) -> Any:
-        is_list = get_origin(info.type) is tuple and get_args(info.type)[-1:] == (...,)
-        if asked or not (is_list or get_origin(info.type) is dict):
+    def ruled(info: Any) -> Any:
+        is_many = get_origin(info.type) in (tuple, dict)
+        if info in asked or not (is_many or info.type is float):
             return None
         asked.append(info)  # by this rule; the usual ones answer
         spec: Any = ConstructorRegistry.get_primitive_spec(info)
         asked.pop()
         shown = getattr(spec, "str_from_instance", None)
-        return shown and replace(spec, str_from_instance=lambda values: shown(values) or ["unset"])
 
-    rules.primitive_rule(named)
+        def read(words: list[str]) -> Any:
+            with contextlib.suppress(ValueError):
+                value = spec.instance_from_str(words)
+                if is_many or math.isfinite(value):
+                    return value
+            raise ValueError(f"no type matching {spec.metavar} could be instantiated from {words}.")
+
+        return shown and replace(
+            spec, instance_from_str=read, str_from_instance=lambda value: shown(value) or ["unset"]
+        )
+
+    rules.primitive_rule(ruled)
     return rules
 
 
@@ -250,15 +252,14 @@ def _other_faults(command: type, words: list[str], verb: str, default: Any) -> s
 @contextlib.contextmanager
 def _unwrapped(words: list[str]) -> Iterator[None]:
     """Have messages in lines of any length; help keeps the width of the terminal."""
-    before = os.environ.get("COLUMNS")
+    before = dict(os.environ)
     if not {"-h", "--help"} & set(words):
         os.environ["COLUMNS"] = "100000"
     try:
         yield
     finally:
         os.environ.pop("COLUMNS", None)
-        if before is not None:
-            os.environ["COLUMNS"] = before
+        os.environ.update(before)
 
 
 def in_one_line(box: str) -> str:
@@ -281,16 +282,18 @@ def in_one_line(box: str) -> str:
 
 
 _UNFIT = (  # what tyro says of a value that is no number, and how people say it
-    (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 is \2; give a number"),
     (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 is \2; give a whole number"),
-    (r"Error parsing (\S+): no type matching (.*?) could be .* from \[(.*?)\]\.;.*", r"\1 is \3; give \2"),
-    (r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]", r"\1 can't be \2"),
+    (r"Error parsing (\S+): no type matching (.*?) could .*? \[(.*?)\](\.. (Got|-) .*)?", r"\1 is \3; give \2"),
     (r"invalid choice ('.*?') for argument '(\S+)'\. Expected one of \((.*?),?\)", r"\2 is \1; give one of \3"),
     (r"\{None\}\||, 'None'(?!,)|'None', ", ""),
     (r"(Perhaps you meant: --.*?, --.*?, --.*?), --.*", r"\1 or others"),  # the rest of a group of flags
-    (r"\b(INT|STR)\|", r"\1 or "),
     (r"\{([^,|}]*)\}", r"\1"),
+    (r"(; give) INT\b(?! INT)", r"\1 a whole number"),
+    (r"(; give) FLOAT\b(?! FLOAT)", r"\1 a number"),
+    (r"number\|\{(\w+),(\w+)\}", r"number, \1 or \2"),
+    (r"\b(number|STR)\|", r"\1 or "),
     (r"\bFLOAT\b", "NUMBER"),
+    (r"(?i)( is [^;]*'[+-]?(?:nan|inf|[\d.]+e)[^;]*; give [^;]*?)(?<!whole )(?=number)", r"\1finite "),
 )
 
 
@@ -343,10 +346,9 @@ def check_files(*paths: Path) -> None:
 def flag_value(words: list[str], flag: str) -> str | None:
     """Return the value of a flag, given as `--flag value` or `--flag=value`; None where it is not given."""
     for word, following in zip(words, [*words[1:], None], strict=False):
-        if word == flag and following is not None:
-            return following
-        if word.startswith(f"{flag}="):
-            return word.partition("=")[2]
+        name, equals, value = word.partition("=")
+        if name == flag and (equals or following is not None):
+            return value if equals else following
     return None
 
 

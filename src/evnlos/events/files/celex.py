@@ -32,6 +32,7 @@ from evnlos.events.files.columns import (
     unreadable,
 )
 
+_CLOCK = "give celex=CelexOptions(clock_mhz=...) (--celex.clock-mhz MHZ)"
 # Ticks are 1024 / D microseconds; D for clocks of 10, 20, ... 100 MHz.
 _DIVISORS = (80, 80, 90, 80, 100, 120, 140, 80, 90, 100)
 
@@ -128,7 +129,7 @@ def parse_header(path: Path, options: CelexOptions) -> CelexHeader:
         raise unreadable(path, 0, f"a CeleX header of {len(data)} bytes", "12 are needed: copy the file again")
     event_format = data[4] if options.event_format is None else options.event_format
     if event_format > 2:
-        cure = "0, 1 and 2 exist: give celex=CelexOptions(event_format=...)"
+        cure = "0, 1 and 2 exist: give celex=CelexOptions(event_format=...) (--celex.event-format N)"
         raise unreadable(path, 4, f"event format {event_format}", cure)
     crashed = options.event_format is not None
     has_imu = bool(data[0] & 2) if options.has_imu is None else options.has_imu
@@ -175,7 +176,8 @@ def walk_packages(file: FileIO, header: CelexHeader, report: ReadReport) -> Iter
     if header.packages and count != header.packages:
         kind = "truncated" if count < header.packages else "count"
         found = f"{count} packages where the header announces {header.packages}"
-        cure = f"after a crash give celex=CelexOptions(event_format={header.event_format}), or {SALVAGE}"
+        stated = f"celex=CelexOptions(event_format={(n := header.event_format)}) (--celex.event-format {n})"
+        cure = f"after a crash give {stated}, or {SALVAGE}"
         report.fault(kind, size, found, cure)
 
 
@@ -204,7 +206,7 @@ class CelexSource:
         clock = options.clock_mhz or clock_from_name(path)
         if clock is None:
             found = "a file name without the sensor's clock"
-            report.fault("header", 0, found, "name it ..._100M.bin or give celex=CelexOptions(clock_mhz=...)")
+            report.fault("header", 0, found, f"name it ..._100M.bin or {_CLOCK}")
             clock = 100
         self._divisor = tick_divisor(clock)
         self._buffer = np.empty(_MAX_PAYLOAD, np.uint8)
@@ -372,7 +374,7 @@ class UnwrapTimes:
     def _divisor(self) -> int:
         if self._clock is None:
             found = "times that turn over or count ticks, and no clock"
-            self._report.fault("header", 0, found, "give celex=CelexOptions(clock_mhz=...)")
+            self._report.fault("header", 0, found, _CLOCK)
             self._clock = 100
         return tick_divisor(self._clock)
 

@@ -21,6 +21,7 @@ _CURE = "the file is damaged or not complete: copy it again"
 _REQUIRED = ("t_us", "x", "y", "p")
 _OPTIONAL = ("adc", "polarity_known")
 _ALIASES = {"t": "t_us"}
+_LEVEL = 1  # of deflate: a fifth of the time of 6, and files of sensors are 8 to 18 % larger
 _EVENT_BYTES = 39  # of an event as columns, as what is stored, and as bytes that are read
 
 
@@ -175,7 +176,7 @@ class NpzSink:
 
     def finish(self) -> None:
         """Write the archive."""
-        with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED) as archive:
+        with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
             for name, file in self._held.items():
                 header = {"descr": self._dtypes[name].str, "fortran_order": False, "shape": (self._events,)}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
