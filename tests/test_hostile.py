@@ -664,6 +664,7 @@ def photograph(**changes: Any) -> dict[str, Any]:
         {"wall": np.array(["a"])}, {"wall": np.full((8, 8), np.inf)}, {"cell_size_m": np.zeros(0)},
         {"cell_x_m": np.zeros((2, 2))}, {"wall_x_m": np.zeros(3)}, {"occluder_polygons_m": np.zeros(5)},
         {"emission_exponent": np.zeros(3)}, {"truth": np.zeros((9, 9))}, {"distance_m": np.array(0.0)},
+        {"emission_exponent": np.array([-1.0, 0.0])},
         {"wall": np.zeros((8, 8))}, {"cell_size_m": np.array([1e300, 1e-300])}, {"wall": np.zeros((2, 3, 4))},
     ],
     ids=str,

@@ -1,6 +1,7 @@
 """The radiometric matrix: reflectance, geometry, quadrature, mode counts."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -308,6 +309,8 @@ def test_torch_lit_setup_is_the_bare_one_times_the_light():
     ratio = lit.transport((4, 6)).matrix / bare.transport((4, 6)).matrix
     torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
     assert float(ratio.max() / ratio.min()) > 1.05
+    with pytest.raises(ConfigError, match="lamp_half_angle_deg is -1"):
+        replace(lit, lamp_half_angle_deg=-1).emission(lit.target_cells())
 
 
 def test_colour():

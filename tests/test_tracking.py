@@ -486,8 +486,9 @@ def test_speed_and_direction() -> None:
 def test_settings_that_cannot_be_are_refused() -> None:
     with pytest.raises(ConfigError, match="columns is 4"):
         Tracking(columns=4)
-    with pytest.raises(ConfigError, match="window_s is 0"):
-        Tracking(window_s=0.0)
+    for name, value in (("window_s", 0.0), ("cells", -1), ("degree", -1), ("target_size_m", -0.1)):
+        with pytest.raises(ConfigError, match=f"{name} is {value}; give"):
+            Tracking(**{name: value})
     with pytest.raises(ConfigError, match="depth needs a setup"):
         track_frames(np.zeros((9, *SHAPE)), np.arange(9.0), settings=Tracking(depth=True))
     with pytest.raises(DataError, match="3 frames"):

@@ -164,6 +164,8 @@ def _photograph(
     distance = float(data["distance_m"])
     polygons = data.get("occluder_polygons_m", np.zeros((0, 4, 3)))
     exponent = emission_exponent or _exponent(data)
+    if not all(0 <= value <= _STEEPEST for value in exponent):
+        raise ConfigError(f"the emission's exponents are {exponent}; give two numbers from 0 to {_STEEPEST}")
     return Photograph(
         wall, Patches(x, -z, pitch), screen, distance, convex_occluders(polygons, distance), exponent, truth
     )
@@ -208,6 +210,9 @@ def _channels(data: dict[str, Any], name: str) -> torch.Tensor | None:
     if f"{name}_rgb" in data:
         return torch.as_tensor(np.asarray(data[f"{name}_rgb"], np.float32)).permute(2, 0, 1).contiguous()
     return None
+
+
+_STEEPEST = 100  # fall of a screen's light with the angle
 
 
 def _exponent(data: dict[str, Any]) -> tuple[float, float]:

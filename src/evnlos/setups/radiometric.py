@@ -151,6 +151,8 @@ class RadiometricSetup(Setup):
         if self.lamp_m is None:
             return None
         offset_m, half = self.offset_m(), self.lamp_half_angle_deg
+        if not 0 < half < 90:
+            raise ConfigError(f"lamp_half_angle_deg is {half}; give above 0 and below 90 degrees")
         return lamp_radiance(source, self.distance_m, self.lamp_m, offset_m=offset_m, half_angle_deg=half)
 
     def transport(self, shape: tuple[int, int] | None = None) -> MatrixTransport:

@@ -118,9 +118,9 @@ class Tracking:
             raise ConfigError(f"Tracking.columns is {self.columns}; give 16 pixels or more")
         if self.targets != "auto" and not 1 <= self.targets <= MOST_TARGETS:
             raise ConfigError(f"Tracking.targets is {self.targets}; give 1 to {MOST_TARGETS}, or auto")
-        for name in ("window_s", "target_size_m"):
-            if not (getattr(self, name) is None or getattr(self, name) > 0):
-                raise ConfigError(f"Tracking.{name} is {getattr(self, name)}; give a positive number")
+        for name, least in (("cells", 2), ("degree", 0), ("window_s", 1e-6), ("target_size_m", 1e-6)):
+            if not ((value := getattr(self, name)) is None or value >= least):
+                raise ConfigError(f"Tracking.{name} is {value}; give {least} or more")
 
     @property
     def most_columns(self) -> int:
