@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import io
+import json
 import re
 import sys
 from dataclasses import fields
@@ -159,6 +160,28 @@ def test_no_page_to_start_with_asks_for_a_compiler() -> None:
     for page in (ROOT / "README.md", *(DOCS / f"{name}.md" for name in ("install", "tour", "quickstart"))):
         assert not re.search(r"\bgcc\b|\bclang\b|build-essential", page.read_text()), page.name
     assert "no compiler" in (DOCS / "install.md").read_text()
+
+
+_ROWS = {
+    "E2E, its positions aligned and averaged (the strongest E2E)": "e2e-single-positions-averaged",
+    "calibrated simulation only, whole sequence": "simulation-only-sequence",
+    "EPNP, whole sequence": "epnp-sequence",
+}
+
+
+def test_the_readme_has_the_scores_of_the_records() -> None:
+    """Whole sequences, three seeds: records that are renewed need the page renewed."""
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    records = ROOT / "benchmarks" / "results" / "experiments" / "sequence"
+    for row, arm in _ROWS.items():
+        (line,) = [line for line in page.splitlines() if line.startswith(f"| {row} |")]
+        told = [tuple(map(float, pair)) for pair in re.findall(r"([\d.]+) ± ([\d.]+)", line)]
+        for (mean, spread), modality in zip(told, ("frame", "event", "fusion"), strict=True):
+            files = [records / f"near-test-{arm}-{modality}-seed{seed}.json" for seed in range(3)]
+            scores = [list(json.loads(file.read_text())["scores"]["psnr_db"].values()) for file in files]
+            seeds = np.mean(scores, axis=1)
+            assert seeds.mean() == pytest.approx(mean, abs=0.006), (row, modality)
+            assert seeds.std(ddof=1) == pytest.approx(spread, abs=0.006), (row, modality)
 
 
 def test_the_figure_of_rooms_shows_the_table_of_its_page() -> None:

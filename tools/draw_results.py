@@ -25,10 +25,10 @@ METHODS = {
     "E2E, one position": "captures/near-test-e2e",
     "simulation only, one position": "captures/near-test-simulation-only",
     "EPNP, one position": "captures/near-test-epnp",
-    "E2E, sequence": "joint/near-test-e2e-joint",
-    "simulation only, sequence": "joint/near-test-simulation-only-joint",
-    "EPNP, sequence": "joint/near-test-epnp-joint",
-    "EPNP, sequence + consistency": "joint/near-test-epnp-joint-consistency",
+    "E2E, its positions averaged": "sequence/near-test-e2e-single-positions-averaged",
+    "simulation only, sequence": "sequence/near-test-simulation-only-sequence",
+    "EPNP, sequence": "sequence/near-test-epnp-sequence",
+    "EPNP, sequence + consistency": "sequence/near-test-epnp-sequence-consistency",
 }
 SEES = {"frames": "frame", "events": "event", "fusion": "fusion"}
 WALLS = ROOT / "docs" / "walls.md"
