@@ -25,7 +25,7 @@ def test_this_installation_is_whole(capsys) -> None:
 
 
 def test_a_broken_part_is_named_and_the_exit_code_tells(monkeypatch, capsys) -> None:
-    def full(dir: Path) -> None:  # noqa: A002  the name of tempfile
+    def full(dir: Path) -> None:
         raise OSError(28, "No space left on device", str(dir))
 
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda _: False)

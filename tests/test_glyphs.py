@@ -90,7 +90,9 @@ def test_without_the_open_families_the_extra_is_named(monkeypatch):
     with pytest.raises(MissingDependencyError, match=r"evnlos\[fonts\]"):
         find_font("Caveat")
     parts = [part for part in doctor.examine() if part.name in ("fonts", "comic face")]
-    assert len(parts) == 2 and not any(part.there or part.needed for part in parts) and "[fonts]" in parts[0].cure
+    assert (
+        len(parts) == 2 and not any(part.there or part.needed for part in parts) and "[fonts]" in parts[0].cure
+    )
 
 
 def test_a_font_file_is_taken_as_it_is(tmp_path):
