@@ -16,6 +16,7 @@ from evnlos.app.upload import MOST_FILES, read_upload, read_upload_apart, unpack
 from evnlos.errors import DataError
 from evnlos.events import write_events
 from evnlos.models import load_weights
+from evnlos.untrusted import Child
 
 MB = 1_000_000
 
@@ -179,11 +180,12 @@ runpy.run_path({program!r}, run_name="__main__")
 
 
 def reader(tmp_path: Path, monkeypatch, text: str) -> None:
-    """Let another program read the uploads."""
+    """Let another program read the uploads, and give it less time."""
     from evnlos.app import upload
 
-    (tmp_path / "reader.py").write_text(text.format(program=str(upload._PROGRAM)))
-    monkeypatch.setattr(upload, "_PROGRAM", tmp_path / "reader.py")
+    other = tmp_path / "reader.py"
+    other.write_text(text.format(program=upload.__file__))
+    monkeypatch.setattr(upload, "Child", lambda _, words, seconds: Child(other, words, min(seconds, 15)))
 
 
 def test_what_a_process_of_its_own_reads_is_the_same(zipped_capture, app_sequence, tmp_path) -> None:
@@ -201,12 +203,9 @@ def test_what_a_process_of_its_own_reads_is_the_same(zipped_capture, app_sequenc
 
 
 def test_an_upload_that_hangs_holds_nobody(app_sequence, tmp_path, monkeypatch) -> None:
-    from evnlos.app import upload
-
     reader(tmp_path, monkeypatch, SLOW)
     for name in ("slow.raw", "walk.raw"):
         write_events(tmp_path / name, app_sequence.events)
-    monkeypatch.setattr(upload, "_CHILD_S", 15)
     said: list[tuple[str, str]] = []
     hangs = threading.Thread(
         target=lambda: said.append(uploaded(str(tmp_path / "slow.raw"), tmp_path, MB, Networks()))

@@ -60,6 +60,27 @@ LEAVES = {
 FILES = sorted(SOURCE.rglob("*.py"))
 TESTS = Path(__file__).parent
 MOST_DEEP_IMPORTS = 111
+OF_NAMED_TUPLES = {"_asdict", "_fields", "_make", "_replace"}  # private by their look only
+PRIVATE_TOUCHES = {
+    ("test_capture_sources.py", "_BLOCK_BYTES"): "small: a block of 64 MB is not filled in seconds",
+    ("test_capture_sources.py", "_HELD_BYTES"): "small: an import holds 64 MB of frames",
+    ("test_comparison.py", "_TOGETHER"): "small: 128 samples are compared at a time",
+    ("test_conditions.py", "_GAINS"): "small: each condition tries them all",
+    ("test_conditions.py", "_SENSOR"): "small: each condition simulates all pixels",
+    ("test_event_files_stream.py", "_BLOCK_BYTES"): "small: a decoder's state survives a cut at every word",
+    ("test_event_files_stream.py", "_LOOK_AHEAD"): "small: 131,072 events are judged together",
+    ("test_event_files_write.py", "_BLOCK_BYTES"): "small: a decoder's state survives a cut at every word",
+    ("test_event_files_write.py", "_CHUNK"): "small: 65,536 events are copied at a time",
+    ("test_event_files_write.py", "_PIECE"): "small: 65,536 events are put together",
+    ("test_live.py", "_MOST_ANIMATED"): "small: 3000 images",
+    ("test_live.py", "_SILENT_S"): "short: a silent viewer is let go after ten seconds",
+    ("test_pretrained.py", "_CHECKOUT"): "place: as where the package is no checkout",
+    ("test_progress.py", "_BEAT_S"): "short: two looks a second",
+    ("test_sequence_network.py", "_POPULATIONS"): "small: thousands of targets",
+    ("test_wall.py", "_shifted"): "kernel: the slow reference of the compiled shift",
+    ("test_wall.py", "_write"): "kernel: the compiled shift",
+}
+"""Private names of the package that tests touch, and why: a kernel's own test, or a constant made small."""
 
 
 def imported(path: Path, *, lazy: bool) -> set[str]:
@@ -235,3 +256,60 @@ def test_tests_speak_to_the_faces_of_stages() -> None:
     """How many modules inside of stages tests import may only shrink; a rename changes nothing."""
     found = set().union(*(deep_imports(path) for path in TESTS.glob("*.py")))
     assert len(found) <= MOST_DEEP_IMPORTS, f"import from the stages what these offer: {sorted(found)}"
+
+
+def is_private(name: str) -> bool:
+    """Return whether a name is private: one underscore in front, and no method of a named tuple."""
+    return name.startswith("_") and not name.startswith("__") and name not in OF_NAMED_TUPLES
+
+
+def private_touches(text: str) -> set[str]:
+    """Return the private names of other modules that a test's source reads, imports, calls or replaces.
+
+    What a class calls of itself is its own. A string counts where a function takes it for the name of an
+    attribute, as `monkeypatch.setattr` does.
+    """
+    found = set[str]()
+    for node in ast.walk(ast.parse(text)):
+        names = list[str]()
+        if isinstance(node, ast.Attribute):
+            own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+            names = [] if own else [node.attr]
+        elif isinstance(node, ast.ImportFrom):
+            names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+        elif isinstance(node, ast.Import):
+            names = [part for alias in node.names for part in alias.name.split(".")]
+        elif isinstance(node, ast.Call):
+            called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            if called in ("setattr", "getattr", "delattr", "hasattr", "attrgetter", "patch", "object"):
+                parts = [part for one in node.args for part in ast.walk(one) if isinstance(part, ast.Constant)]
+                names = [
+                    name for part in parts if isinstance(part.value, str) for name in part.value.split(".")
+                ]
+        found |= {name for name in names if name.isidentifier() and is_private(name)}
+    return found
+
+
+def test_tests_touch_no_private_names() -> None:
+    """What deserves a test has a name of its own; the table's entries go where they are no longer needed."""
+    touched = {(path.name, name) for path in TESTS.glob("*.py") for name in private_touches(path.read_text())}
+    assert touched - PRIVATE_TOUCHES.keys() == set(), "test through the public face"
+    assert PRIVATE_TOUCHES.keys() - touched == set(), "no longer needed: take these out of the table"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "room._thing",
+        "from evnlos.room import _thing",
+        "from evnlos._thing import other",
+        "import evnlos._thing",
+        'monkeypatch.setattr("evnlos.room._thing", 3)',
+        'monkeypatch.setattr(f"{room}._thing", 3)',
+        'monkeypatch.setattr(room, "_thing", 3)',
+        'getattr(room, "_thing")',
+    ],
+)
+def test_a_private_touch_is_seen(text: str) -> None:
+    assert private_touches(text) == {"_thing"}
+    assert private_touches(text.replace("_thing", "thing")) == set()

@@ -19,6 +19,7 @@ from PIL import Image
 import evnlos
 from evnlos.calibration import (
     Calibration,
+    CaptureSet,
     FrameModel,
     Residual,
     Shown,
@@ -35,7 +36,7 @@ from evnlos.calibration import (
 )
 from evnlos.calibration.captures import paper
 from evnlos.calibration.event_fit import shortest_interval_s
-from evnlos.calibration.event_statistics import _block_counts, count_map, read_recordings, within
+from evnlos.calibration.event_statistics import block_counts, count_map, read_recordings, within
 from evnlos.calibration.frame_model import frame_doubt, working_shape
 from evnlos.calibration.transport_fit import clustered_error, levenberg_marquardt, values_of
 from evnlos.cameras import EventPixel, FrameCamera
@@ -466,7 +467,7 @@ def test_event_statistics_count_by_hand() -> None:
     part = within(events, 10e-6, 20e-6)
     assert part.t_us.tolist() == [20, 20]
     assert shortest_interval_s([events], share=0.0) == pytest.approx(10e-6)
-    blocks = _block_counts(events, np.array([0, 15, 40]))  # (0, 15] and (15, 40]
+    blocks = block_counts(events, np.array([0, 15, 40]))  # (0, 15] and (15, 40]
     assert blocks.shape == (2, 2, 2, 2)
     assert blocks[:, 0].sum((1, 2)) * 25 == pytest.approx([1, 2])
     assert blocks[:, 1].sum((1, 2)) * 25 == pytest.approx([0, 1])
@@ -481,17 +482,26 @@ def test_light_of_recordings_follows_the_wall(folders) -> None:
     assert np.allclose(found[0].light[7], 255 * wall.irradiance(found[0].times_s[7]).numpy(), atol=1e-3)
 
 
-def test_some_pixels_of_a_large_sensor_tell_its_event_pixel(folders, monkeypatch) -> None:
+def test_some_pixels_of_a_large_sensor_tell_its_event_pixel(folders) -> None:
     """The light of a sensor of many pixels takes gigabytes: it is kept of each second row and column."""
-    fit, _ = read_capture_set(folders)
-    (whole,) = read_recordings(fit, SETUP, 1)
-    monkeypatch.setattr("evnlos.calibration.event_statistics._MOST_PX", whole.light[0].size // 4)
-    monkeypatch.setattr("evnlos.calibration.event_statistics._AT_ONCE", 7)
-    (part,) = read_recordings(fit, SETUP, 1)
-    np.testing.assert_allclose(part.light, whole.light[:, ::2, ::2], rtol=1e-6)
-    assert part.events.shape == part.light.shape[1:] and np.array_equal(part.times_s, whole.times_s)
-    kept = (whole.events.x % 2 == 0) & (whole.events.y % 2 == 0)
-    np.testing.assert_array_equal(part.events.t_us, whole.events.t_us[kept])
+    height, width, draw = 184, 288, np.random.default_rng(0)
+    t_us = np.sort(draw.integers(2_000_000, 6_000_000, 3_000))
+    x, y, p = draw.integers(0, width, 3_000), draw.integers(0, height, 3_000), t_us % 2 == 0
+    large = replace(
+        read_capture(folders[0]),
+        events=Events(t_us, x, y, p, width, height),
+        frames=np.zeros((2, height, width), np.uint8),
+        frame_times_us=np.array([3_000_000, 5_000_000]),
+    )
+    setup, captures = PaperSetup(), CaptureSet((large,))
+    (part,) = read_recordings(captures, setup, 1)
+    assert part.times_s[[0, -1]].tolist() == [3.0, 5.0] and len(part.times_s) > 100
+    whole = 255 * setup.resized((height, width)).observe(captures.scenes[0]).irradiance(part.times_s).numpy()
+    np.testing.assert_allclose(part.light, whole[:, ::2, ::2], rtol=1e-6)
+    kept = (x % 2 == 0) & (y % 2 == 0) & (t_us > 3_000_000) & (t_us <= 5_000_000)
+    np.testing.assert_array_equal(part.events.t_us, t_us[kept])
+    np.testing.assert_array_equal(part.events.x, x[kept] // 2)
+    assert part.events.shape == part.light.shape[1:] == (height // 2, width // 2)
 
 
 def test_working_shape_keeps_the_sensor_s_shape() -> None:

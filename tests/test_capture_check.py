@@ -13,7 +13,7 @@ from PIL import Image
 
 from evnlos.cli import main
 from evnlos.data import CaptureInfo, SensorSize, open_dataset, read_capture, read_shard
-from evnlos.data.capture_check import Finding, _offset, check_capture, compare_clocks
+from evnlos.data.capture_check import Finding, check_capture, clock_offset, compare_clocks
 from evnlos.data.capture_info import CAMERAS, AlignmentInfo, CameraInfo, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
 from evnlos.data.frames import from_start
@@ -322,7 +322,7 @@ def test_a_polarity_of_a_far_higher_threshold_is_no_clock_offset(tmp_path, leak_
 
 def offset_level(capture, shift_us: int = 0) -> str:
     """Return the level of the clock offset with the frames' times moved."""
-    (found,) = _offset(replace(capture, frame_times_us=capture.frame_times_us + shift_us))
+    (found,) = clock_offset(replace(capture, frame_times_us=capture.frame_times_us + shift_us))
     return found.level
 
 
@@ -335,7 +335,7 @@ def test_what_pixels_do_by_themselves_is_no_bad_clock(shared_data, name, level) 
 
 
 def test_the_middle_course_says_that_it_cannot_be_told(shared_data) -> None:
-    (found,) = _offset(read_capture(shared_data / "captures" / "far_4"))
+    (found,) = clock_offset(read_capture(shared_data / "captures" / "far_4"))
     assert "cannot be told" in found.found and "offset_us" not in found.cure and "trigger_channel" in found.cure
 
 
@@ -391,7 +391,7 @@ def test_a_tenth_of_a_second_is_found_beside_other_captures(name, shared_data, t
         main(["lab", "--out", str(tmp_path), "--setup", name, "--glyphs.characters", "ABCDEFGH"])
         folders = sorted(tmp_path.glob(f"{name}_*"))
     captures = [read_capture(folder) for folder in folders]
-    lags = [one.lag_us for capture in captures for one in _offset(capture) if one.lag_us is not None]
+    lags = [one.lag_us for capture in captures for one in clock_offset(capture) if one.lag_us is not None]
     assert len(lags) == len(captures)
     assert set(beside(lags, captures[0].info)) == {"good"}
     shifted = [

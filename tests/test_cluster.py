@@ -51,7 +51,8 @@ def test_the_command_starts_a_cluster_of_its_own(tiny, tiny_dataset, tmp_path, c
 def test_a_scheduler_that_is_not_there_is_one_line(tiny, tmp_path, monkeypatch) -> None:
     import dask
 
-    monkeypatch.setattr("evnlos.data.pool._PATIENCE_S", 3.0)
+    client = distributed.Client
+    monkeypatch.setattr(distributed, "Client", lambda address, **_: client(address, timeout=3.0))
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(EvnlosError, match="answer"),

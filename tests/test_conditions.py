@@ -75,8 +75,8 @@ def test_further_unknowns_cost_what_a_larger_posterior_says() -> None:
     rows = np.random.default_rng(0).standard_normal((40, 7))
     whole = rows.T @ rows
     kept = np.linalg.inv(np.linalg.inv(np.eye(7) + whole)[:5, :5]) - np.eye(5)
-    np.testing.assert_allclose(module._known(whole, 5), kept, atol=1e-10)
-    np.testing.assert_array_equal(module._known(whole, 7), whole)
+    np.testing.assert_allclose(module.marginal_information(whole, 5), kept, atol=1e-10)
+    np.testing.assert_array_equal(module.marginal_information(whole, 7), whole)
 
 
 def test_an_unknown_motion_is_a_shift_in_time() -> None:
@@ -85,7 +85,7 @@ def test_an_unknown_motion_is_a_shift_in_time() -> None:
     right = np.sin(3 * times)[:, None, None] * np.ones((1, 1, 2))
     light = SequenceLight(np.ones((4, 1)), right, np.zeros((4, 1), np.float32), times, (2, 2))
     asked = replace(Condition("a").asked, speed_m_s=0.08)
-    (found,) = module._motions(light, [np.array([0.5])], asked)
+    (found,) = module.motion_unknowns(light, [np.array([0.5])], asked)
     late_s = 0.01 / 0.08
     expected = 1.5 * np.cos(3 * times) * 3 * late_s
     np.testing.assert_allclose(found.right[5:-5, 0, 2], expected[5:-5], atol=1e-3)

@@ -229,6 +229,27 @@ def test_aedat4_with_frames_and_events(tmp_path):
             write_aedat4(tmp_path / "wrong.aedat4", events, wrong, times)
 
 
+def packets(path: Path) -> list[tuple[int, bytes]]:
+    """Return stream and content of each packet of an AEDAT4 file without a data table."""
+    data, found = path.read_bytes(), []
+    at = len(aedat4.SIGNATURE)
+    at += 4 + struct.unpack_from("<I", data, at)[0]
+    while at < len(data):
+        number, size = struct.unpack_from("<ii", data, at)
+        found.append((number, data[at + 8 : at + 8 + size]))
+        at += 8 + size
+    return found
+
+
+def io_header(description: bytes) -> bytes:
+    """Return the flat buffer of an AEDAT4 file's header: nothing is packed, no data table, a description."""
+    vtable = struct.pack("<5H", 10, 20, 12, 4, 16)  # at 12
+    table = struct.pack("<iqiI", 28 - 12, -1, 0, 4)  # at 28
+    text = struct.pack("<I", len(description)) + description + b"\0"  # at 48
+    body = struct.pack("<I4s", 28 - 4, b"IOHE") + vtable + bytes(6) + table + text
+    return struct.pack("<I", len(body)) + body
+
+
 def test_cameras_of_an_aedat4_are_listed_and_chosen(tmp_path):
     """Two cameras in one file: neither is taken in silence, and each is had by its name."""
     pytest.importorskip("aedat")
@@ -242,11 +263,14 @@ def test_cameras_of_an_aedat4_are_listed_and_chosen(tmp_path):
     streams = ((0, "left", "EVTS"), (1, "right", "EVTS"), (2, "imu", "IMUS"), (3, "frames", "FRME"))
     nodes = "".join(node.format(*one, *size) for one in streams)
     text = f'<dv version="2.0"><node name="outInfo" path="/outInfo/">{nodes}</node></dv>'
-    data = aedat4.SIGNATURE + aedat4._header(text.encode())
+    data = aedat4.SIGNATURE + io_header(text.encode())
     for number, events in ((0, left), (1, right)):
-        packet = aedat4._event_packet(events)
-        data += struct.pack("<ii", number, len(packet)) + packet
-    picture = aedat4._frame_packet(np.full((4, 6), 7, np.uint8), 5)
+        write_events(tmp_path / "one.aedat4", events)
+        data += b"".join(
+            struct.pack("<ii", number, len(one)) + one for _, one in packets(tmp_path / "one.aedat4")
+        )
+    write_aedat4(tmp_path / "one.aedat4", left[:0], np.full((1, 4, 6), 7, np.uint8), np.array([5]))
+    ((_, picture),) = packets(tmp_path / "one.aedat4")
     path = tmp_path / "two.aedat4"
     path.write_bytes(data + struct.pack("<ii", 3, len(picture)) + picture)
     with pytest.raises(EventFileError, match=r"2 streams of events; give topic=.*: 0/left, 1/right"):

@@ -2,7 +2,9 @@
 
 import gzip
 import struct
+import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -70,8 +72,8 @@ def test_comic_neue_bold_is_the_bold_file():
 
 
 def test_a_comic_font_that_is_not_installed_is_replaced_and_said(monkeypatch):
-    packaged = tuple(fonts._packaged_fonts())
-    monkeypatch.setattr(fonts, "installed_fonts", lambda: packaged)
+    others = tuple(one for one in fonts.installed_fonts() if "comic" not in one.family.casefold())
+    monkeypatch.setattr(fonts, "installed_fonts", lambda: others)
     font = find_font("Comic Neue Bold")
     assert (font.family, font.weight, font.substituted_for) == ("Kalam", 700, "Comic Neue Bold")
     assert "fonts-comic-neue" in font.note
@@ -82,12 +84,15 @@ def test_a_comic_font_that_is_not_installed_is_replaced_and_said(monkeypatch):
 
 def test_without_the_open_families_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "fontpkg", None)
-    monkeypatch.setattr(fonts, "_system_fonts", lambda: iter(()))
+    monkeypatch.setattr(fonts, "which", lambda _: "fc-list")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=b""))  # it knows no font
     monkeypatch.setattr(fonts, "installed_fonts", fonts.installed_fonts.__wrapped__)
     with pytest.raises(MissingDependencyError, match=r"evnlos\[fonts\]"):
         find_font("Caveat")
-    parts = [doctor._fonts(), doctor._comic()]
-    assert not any(part.there or part.needed for part in parts) and "[fonts]" in parts[0].cure
+    parts = [part for part in doctor.examine() if part.name in ("fonts", "comic face")]
+    assert (
+        len(parts) == 2 and not any(part.there or part.needed for part in parts) and "[fonts]" in parts[0].cure
+    )
 
 
 def test_a_font_file_is_taken_as_it_is(tmp_path):
@@ -109,12 +114,14 @@ def test_an_unknown_family_names_the_nearest_one():
 
 def test_folders_are_scanned_where_fontconfig_is_not_there(monkeypatch, tmp_path):
     path = find_font("Kalam Bold").path
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "k.ttf").write_bytes(path.read_bytes())
-    (tmp_path / "broken.ttf").write_bytes(b"x")
+    folder = tmp_path / ".fonts"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "sub" / "k.ttf").write_bytes(path.read_bytes())
+    (folder / "broken.ttf").write_bytes(b"x")
     monkeypatch.setattr(fonts, "which", lambda name: None)
-    monkeypatch.setattr(fonts, "_font_folders", lambda: [tmp_path, tmp_path / "none"])
-    assert [(font.family, font.weight) for font in fonts._system_fonts()] == [("Kalam", 700)]
+    monkeypatch.setenv("HOME", str(tmp_path))
+    found = [font for font in fonts.installed_fonts.__wrapped__() if folder in font.path.parents]
+    assert [(font.family, font.weight) for font in found] == [("Kalam", 700)]
 
 
 # Glyphs

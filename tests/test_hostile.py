@@ -29,7 +29,7 @@ from evnlos.data import Simulation, open_dataset, read_capture
 from evnlos.data.simulate import object_bytes
 from evnlos.data.simulations import find_faults
 from evnlos.errors import ConfigError, printable
-from evnlos.events.recording import Recording, _Counts
+from evnlos.events.recording import Recording, summarise
 from evnlos.inverse import read_photograph
 from evnlos.models import UNetConfig
 from evnlos.types import Events
@@ -231,12 +231,15 @@ def test_no_flipped_byte_of_a_page_goes_unseen(tiny_dataset, tmp_path) -> None:
 @pytest.mark.parametrize(
     "line", ['{"epoch": "one"}', '{"epoch": 1, "loss": NaN}', "[1]", "1", "{", '{"loss": 1}']
 )
-def test_a_garbled_log_of_a_training_is_one_line(line: str, tmp_path) -> None:
-    from evnlos.report.tables import _log_of
+def test_a_garbled_log_of_a_training_is_one_line(line: str, tiny_dataset, tmp_path) -> None:
+    from evnlos.models import Weights, save_weights
+    from evnlos.report import collect_results
 
+    network = UNetConfig(width=4, depth=1, rank=0).build("frame", tiny_dataset.sampling)
+    save_weights(tmp_path / "weights.safetensors", Weights(network))
     (tmp_path / "metrics.jsonl").write_text(json.dumps({"epoch": 1, "loss": 0.5}) + f"\n{line}\n")
     with pytest.raises(EvnlosError, match="not a training log"):
-        _log_of(tmp_path)
+        collect_results([tmp_path], tiny_dataset.folder, "all")
 
 
 def test_small_images_are_scored_without_haarpsi() -> None:
@@ -294,12 +297,14 @@ def test_memory_follows_the_events_not_the_claimed_sensor(tmp_path, bounded_memo
 
 def test_a_sparse_count_is_that_of_a_full_one() -> None:
     draw = np.random.default_rng(0)
-    dense, sparse = _Counts(1000), _Counts(MOST_SENSOR_PIXELS + 1)
+    side = int(np.sqrt(MOST_SENSOR_PIXELS)) + 1
+    dense, sparse = list[Events](), list[Events]()
     for _ in range(5):
-        where = draw.integers(0, 1000, 400)
-        dense.add(where)
-        sparse.add(where)
-        assert (dense.active(), dense.busiest()) == (sparse.active(), sparse.busiest())
+        columns = np.arange(400), draw.integers(0, 40, 400), draw.integers(0, 25, 400), np.ones(400, bool)
+        dense.append(Events(*columns, 40, 25))
+        sparse.append(Events(*columns, side, side))
+        full, found = summarise(dense), summarise(sparse)
+        assert (found.active_pixels, found.busiest) == (full.active_pixels, full.busiest)
 
 
 def _image_of(path: Path, width: int, height: int) -> None:
@@ -524,7 +529,7 @@ def test_experiments_are_estimated_first_and_can_be_forced(words, tmp_path, caps
     monkeypatch.setattr("evnlos.untrusted.memory_left", lambda: 1000)
     # By name: the package's attribute `simulate` is the function, not the module.
     monkeypatch.setattr(sys.modules["evnlos.data.simulate"], "scene_of", begun)
-    monkeypatch.setattr("evnlos.data.lab._scene", begun)
+    monkeypatch.setattr("evnlos.data.lab.with_others", begun)
     with pytest.raises(SystemExit) as ended:
         main([*words, "--out", str(tmp_path / "o"), "--log-level", "error"])
     assert ended.value.code == 2

@@ -6,7 +6,7 @@ import torch
 
 from evnlos.errors import DataError
 from evnlos.models import fit_linear
-from evnlos.models.reconstructor import _LAMBDAS, _left_out
+from evnlos.models.reconstructor import RIDGES, left_out_errors
 
 
 def world(noise: float, objects: int = 30, positions: int = 10, seed: int = 0):
@@ -46,11 +46,11 @@ def test_errors_on_objects_left_out_are_those_of_one_regression_for_each_ridge()
     kept = code[~left].double()
     inner, outer = kept.T @ kept, kept.T @ y[~left].double()
     plain = []
-    for regularization in _LAMBDAS:
+    for regularization in RIDGES:
         ridge = regularization * inner.diagonal().mean() * torch.eye(40, dtype=torch.float64)
         plain.append((code[left].double() @ torch.linalg.solve(inner + ridge, outer) - y[left]).square().sum())
     rest, aim = code[left].double(), y[left].double()
-    found = _left_out(inner, outer, rest.T @ rest, rest.T @ aim) + aim.square().sum()
+    found = left_out_errors(inner, outer, rest.T @ rest, rest.T @ aim) + aim.square().sum()
     torch.testing.assert_close(found, torch.stack(plain), rtol=1e-5, atol=0)
 
 

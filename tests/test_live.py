@@ -6,10 +6,12 @@ import json
 import re
 import socket
 import struct
+import sys
 import threading
 import urllib.error
 import urllib.request
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 
@@ -573,8 +575,7 @@ def test_drops_and_the_error_of_a_source_reach_the_user(engine: Engine) -> None:
             pass
 
     kept = Kept()
-    run = Run(Flood(), engine, RateOptions(rate=1000, queue_events=100))
-    run._engine = Slow(engine)  # until the source has said all
+    run = Run(Flood(), Slow(engine), RateOptions(rate=1000, queue_events=100))
     with pytest.raises(EventFileError, match="cable"):
         run.go([kept])
     summary = run.statistics.summary()
@@ -588,7 +589,7 @@ class Slow:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self.begin = engine.begin
+        self.begin, self.needs_frames = engine.begin, engine.needs_frames
 
     def see(self, chunks):
         for thread in threading.enumerate():
@@ -613,7 +614,7 @@ def recorded(folder: Path, capsys) -> dict:
 
 
 def video_kind() -> str:
-    return "png" if record._pyav() is None else "mp4"
+    return "mp4" if find_spec("av") else "png"
 
 
 def test_headless_writes_video_and_table(event_weights: Path, tmp_path: Path, capsys) -> None:
@@ -651,7 +652,7 @@ def test_headless_writes_video_and_table(event_weights: Path, tmp_path: Path, ca
 
 
 def test_without_pyav_the_video_is_an_animated_png(engine: Engine, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(record, "_pyav", lambda: None)
+    monkeypatch.setitem(sys.modules, "av", None)
     monkeypatch.setattr(record, "_MOST_ANIMATED", 4)
     events = stream(600, 18)
     with record.Recorder(tmp_path / "out") as recorder:
@@ -717,7 +718,7 @@ def test_a_video_on_a_full_disk_is_one_line_and_nothing_is_left(
     if has_pyav:
         pytest.importorskip("av")
     else:
-        monkeypatch.setattr(record, "_pyav", lambda: None)
+        monkeypatch.setitem(sys.modules, "av", None)
     place, events = tmp_path / "small", stream(600, 18)
     place.mkdir()
     with small_disk(place, 4096) as is_small:

@@ -2,7 +2,10 @@
 
 import importlib
 import json
+import os
 import re
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -13,9 +16,10 @@ from evnlos.analysis import AnalysisSettings, evaluate, identify
 from evnlos.calibration.transport_fit import levenberg_marquardt
 from evnlos.cli import main
 from evnlos.errors import ConfigError
-from evnlos.machine import ProgressBars, Step, _duration, note, show_progress
+from evnlos.machine import ProgressBars, Step, note, show_progress
 from evnlos.models import UNetConfig, Weights
 from evnlos.optics import dense_matrix
+from evnlos.optics.radiometric import noted_rows
 from evnlos.setups import load_setup
 from evnlos.types import Plane
 
@@ -28,6 +32,23 @@ def shown(monkeypatch):
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
     yield
     show_progress(None)
+
+
+class Clock:
+    """The clock of progress, which a test puts forward."""
+
+    late_s = 0.0
+
+    def monotonic(self) -> float:
+        """Return the time, seconds."""
+        return time.monotonic() + self.late_s
+
+
+@pytest.fixture
+def clock(monkeypatch) -> Clock:
+    found = Clock()
+    monkeypatch.setattr("evnlos.machine.time", found)
+    return found
 
 
 def work(how: str | None, within="", total: int = 4) -> None:
@@ -102,12 +123,12 @@ def test_what_computes_notes_what_is_at_work(capsys) -> None:
     assert "(main-far)" in told and "(main-far; light path)" not in told
 
 
-def test_a_piece_that_is_done_is_told_once(capsys) -> None:
+def test_a_piece_that_is_done_is_told_once(capsys, clock) -> None:
     show_progress("lines")
     with ProgressBars() as outer:
         outer(Step("render", 18, 19, "captures"))
         time.sleep(0.2)
-        outer._began, outer._said = outer._began - 2, outer._said - 1  # as where the next line is due
+        clock.late_s = 2  # as where the next line is due
         outer(Step("render", 19, 19, "captures"))
         with ProgressBars() as inner:
             inner(Step("simulate", 5, 5, "objects"))  # of a run before this one
@@ -117,8 +138,14 @@ def test_a_piece_that_is_done_is_told_once(capsys) -> None:
     assert told.count("render: 19 of 19") == 1 and told.count("train: 1 of 3") > 2 and "simulate" not in told
 
 
-def test_a_time_is_told_as_people_say_it() -> None:
-    assert [_duration(one) for one in (8.4, 95, 7300)] == ["8 s", "1 min 35 s", "2 h 1 min"]
+@pytest.mark.parametrize(("seconds", "said"), [(8.4, "8 s"), (95, "1 min 35 s"), (7300, "2 h 1 min")])
+def test_a_time_is_told_as_people_say_it(seconds, said, capsys, clock) -> None:
+    show_progress("lines")
+    with ProgressBars() as progress:
+        progress(Step("simulate", 0, 0, "objects"))
+        clock.late_s = seconds
+        progress(Step("simulate", 1, 0, "objects"))
+    assert f"simulate: 1 objects, {said}\n" in capsys.readouterr().err
 
 
 def test_a_fit_says_which_trial_it_makes(monkeypatch) -> None:
@@ -141,60 +168,76 @@ def test_identify_says_what_it_works_on(monkeypatch) -> None:
     assert not [part for part in parts if not any(one.startswith(part) for one in told)]
 
 
-def test_compiling_is_told_apart_from_standing_still(capsys, monkeypatch) -> None:
+def test_compiling_is_told_apart_from_standing_still(capsys, clock) -> None:
     from numba import njit
+    from numba.core import event
 
     @njit
     def kernel(x: float) -> float:
         return x + 1
 
-    seen = list[float | None]()
+    class Slow(event.Listener):
+        """Makes a compilation one that takes three seconds, of which the last line tells."""
+
+        def __init__(self) -> None:
+            self.told = list[str]()
+
+        def on_start(self, event) -> None:
+            clock.late_s += 3
+            capsys.readouterr()
+            time.sleep(0.2)
+            self.told.append(capsys.readouterr().err)
+
+        def on_end(self, event) -> None: ...
+
+    slow = Slow()
     show_progress("lines")
     with ProgressBars() as progress:
         progress(Step("events", 0, 2, "frames"))
         time.sleep(0.1)  # the first look begins to listen
-        from numba.core import event
-
-        class Look(event.Listener):
-            def on_start(self, event) -> None:
-                from evnlos.machine import _compiling_since
-
-                seen.append(_compiling_since())
-
-            def on_end(self, event) -> None: ...
-
-        with event.install_listener("numba:compile", Look()):
+        with event.install_listener("numba:compile", slow):
             kernel(1.0)
             kernel(2.0)
-        monkeypatch.setattr("evnlos.machine._compilations", [time.monotonic() - 3])
+        capsys.readouterr()
         time.sleep(0.2)
-    assert len(seen) == 1 and seen[0] is not None
-    assert "events: 0 of 2 frames (compiling, once per installation)" in capsys.readouterr().err
+    (told,) = slow.told
+    assert "events: 0 of 2 frames (compiling, once per installation)" in told
+    after = capsys.readouterr().err
+    assert "events: 0 of 2 frames" in after and "compiling" not in after
 
 
-def test_compilations_are_listened_for_before_the_first_line(monkeypatch) -> None:
-    import numba  # noqa: F401  as whoever is about to compile
+FIRST_LINE = """
+import time
+import evnlos.machine as machine
+from numba.core import event  # as whoever is about to compile
+with machine.ProgressBars() as progress:
+    progress(machine.Step("reconstruct", 0, 3, "stages"))
+    time.sleep(1.5)
+    event.start_event("numba:compile")
+    time.sleep(1.5)
+    machine.LINE_S = 0.1
+    time.sleep(1.5)
+"""
 
-    monkeypatch.setattr("evnlos.machine.LINE_S", 60.0)
-    monkeypatch.setattr("evnlos.machine._is_listening", False)
-    show_progress("lines")
-    with ProgressBars() as progress:
-        progress(Step("reconstruct", 0, 3, "stages"))
-        time.sleep(0.2)
-        assert importlib.import_module("evnlos.machine")._is_listening
+
+def test_compilations_are_listened_for_before_the_first_line() -> None:
+    known = os.environ | {"EVNLOS_PROGRESS": "lines"}
+    found = subprocess.run([sys.executable, "-c", FIRST_LINE], env=known, capture_output=True, text=True)
+    assert found.stderr.startswith("reconstruct: 0 of 3 stages (compiling, once per installation)")
 
 
 def test_the_flags_stand_anywhere(tmp_path, capsys, monkeypatch) -> None:
-    shown = list[str]()
-    monkeypatch.setattr("evnlos.machine.ProgressBars._show", lambda self: shown.append(self._how))
+    monkeypatch.setattr("evnlos.machine.LINE_S", 1e-6)  # every step is told, however fast it is
     video = tmp_path / "v.npy"
     np.save(video, np.full((3, 4, 6), 100, np.uint8))
     for words, how in ((["--progress", "lines"], "lines"), (["--progress=json"], "json"), (["--json"], "json")):
         main(["events", str(video), "--fps", "10", "--out", str(tmp_path / f"{words[0]}{how}.npz"), *words])
-        assert shown and set(shown) == {how}
-        shown.clear()
+        told = [
+            line for line in capsys.readouterr().err.splitlines() if "3 frames" in line or "progress" in line
+        ]
+        assert told and {"json" if line.startswith('{"progress": ') else "lines" for line in told} == {how}
     main(["events", str(video), "--fps", "10", "--out", str(tmp_path / "q.npz"), "--quiet"])
-    assert not shown
+    assert capsys.readouterr().err == ""
     with pytest.raises(SystemExit):
         main(["--progress", "loud", "doctor"])
     assert "give one of auto, bar, lines, json, none" in capsys.readouterr().err
@@ -207,7 +250,7 @@ def test_a_variable_that_is_none_of_them_is_refused(monkeypatch) -> None:
 
 
 def test_networks_at_work_are_told_with_their_epochs(tmp_path) -> None:
-    from evnlos.experiment.run import Run, _epochs_at_work
+    from evnlos.experiment.run import Run, epochs_at_work
     from evnlos.training import Training
 
     runs = [Run(None, Training(epochs=4), tmp_path / name, None) for name in ("done", "half", "new", "later")]
@@ -216,7 +259,7 @@ def test_networks_at_work_are_told_with_their_epochs(tmp_path) -> None:
         if epochs:
             (tmp_path / name / "metrics.jsonl").write_text('{"epoch": 1}\n' * epochs)
     (tmp_path / "done" / "weights.safetensors").touch()
-    part, text = _epochs_at_work(runs)
+    part, text = epochs_at_work(runs)
     assert part == 0.5
     assert text == "half epoch 3/4, new epoch 1/4"
 
@@ -282,15 +325,19 @@ def test_a_light_path_counts_what_is_done(name: str, monkeypatch) -> None:
     """It stood there as "light path" for as long as it took."""
     noted = list[str]()
     monkeypatch.setattr("evnlos.optics.radiometric.note", noted.append)
-    monkeypatch.setattr("evnlos.optics.radiometric._FEWEST", 64)
-    dense = load_setup(name).operator(Plane(6, 6, 0.013), (25, 40)).dense()
-    assert (
-        len(noted) >= 15
-        and noted[0] == "light path, 0 of 1000 pixels"
-        and noted[1] == "light path, 64 of 1000 pixels"
-    )
-    monkeypatch.setattr("evnlos.optics.radiometric._PARTS", 1)
-    assert torch.equal(dense, load_setup(name).operator(Plane(6, 6, 0.013), (25, 40)).dense())
+    dense = load_setup(name).operator(Plane(6, 6, 0.013), (25, 90)).dense()
+    assert noted[:2] == ["light path, 0 of 2250 pixels", "light path, 2048 of 2250 pixels"]
+    for room in ("optics.facets", "optics.radiometric"):
+        monkeypatch.setattr(f"evnlos.{room}.noted_rows", lambda pixels: [slice(0, pixels)])
+    assert torch.equal(dense, load_setup(name).operator(Plane(6, 6, 0.013), (25, 90)).dense())
+
+
+def test_a_large_light_path_has_sixteen_parts(monkeypatch) -> None:
+    noted = list[str]()
+    monkeypatch.setattr("evnlos.optics.radiometric.note", noted.append)
+    parts = list(noted_rows(100_000))
+    assert [(part.start, part.stop) for part in parts] == [(k * 6250, (k + 1) * 6250) for k in range(16)]
+    assert noted == [f"light path, {k * 6250} of 100000 pixels" for k in range(16)]
 
 
 def test_a_matrix_found_column_by_column_counts_them(monkeypatch) -> None:

@@ -74,7 +74,7 @@ def four_channels():
     made = Modality("four", (*as_modality("fusion").groups, net), "frames, events and their difference")
     MODALITIES.register(made)
     yield made
-    MODALITIES._classes.pop("four")
+    MODALITIES.unregister("four")
 
 
 def test_a_modality_of_four_channels_trains(four_channels, tiny_dataset, tmp_path) -> None:
@@ -87,13 +87,14 @@ def test_a_modality_of_four_channels_trains(four_channels, tiny_dataset, tmp_pat
         found = evaluate(weights, tiny_dataset, "validation").summary()
         assert found["overall"]["psnr_db"] > found["baselines"]["mean"]["overall"]["psnr_db"]
     path = tmp_path / "unet" / "weights.safetensors"
-    MODALITIES._classes["four"] = replace(four_channels, groups=four_channels.groups[:2])
+    MODALITIES.unregister("four")
+    MODALITIES.register(replace(four_channels, groups=four_channels.groups[:2]))
     with pytest.raises(DataError, match="register the modality that it was trained with"):
         load_weights(path)
-    MODALITIES._classes.pop("four")
+    MODALITIES.unregister("four")
     with pytest.raises(DataError, match="modality 'four'"):
         load_weights(path)
-    MODALITIES._classes["four"] = four_channels
+    MODALITIES.register(four_channels)
 
 
 def test_a_group_gives_the_channels_that_it_says(four_channels) -> None:

@@ -23,7 +23,7 @@ from evnlos.plot.setup import PARTITION, setup_drawing
 from evnlos.report import RunResult, seen_in_training, write_report
 from evnlos.report.pictures import curves_svg
 from evnlos.report.provenance import Commands
-from evnlos.report.sections import _points, _worst, gains_of, setup_section
+from evnlos.report.sections import gains_of, setup_section, spectrum_points, worst_images
 from evnlos.report.tables import named
 from evnlos.setups import PaperSetup, RadiometricSetup, lit_setup, named_setup, setup_preset
 
@@ -206,10 +206,10 @@ def test_the_page_explains_its_words_and_fits_a_phone_and_paper(made, tmp_path) 
 
 def test_the_plot_of_what_a_setup_shows_ends_where_the_values_do() -> None:
     values = torch.tensor([10.0, 1.0, 0.1, 1e-5, 1e-2, 1e-4, 1e-9])
-    points = _points(values)
+    points = spectrum_points(values)
     assert [x for x, _ in points] == [1, 2, 3, 4, 5]
     assert [y for _, y in points] == pytest.approx([1, 0, -1, -3, -2], abs=1e-6)
-    assert _points(torch.zeros(4)) == []
+    assert spectrum_points(torch.zeros(4)) == []
 
 
 @pytest.mark.parametrize("name", ["main-near", "hard-far", "aperture-near"])
@@ -306,9 +306,9 @@ def _unmeasured(name: str) -> ConfidenceCheck:
 def test_the_worst_images_are_of_several_objects() -> None:
     gain = np.array([-5.0, -4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0])
     names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])
-    assert _worst(gain, names) == [0, 1, 3, 4, 6, 7]
-    assert _worst(gain, np.full(8, "a")) == list(range(6))  # one object: all are of it
-    assert _worst(gain[:2], names[:2]) == [0, 1]
+    assert worst_images(gain, names) == [0, 1, 3, 4, 6, 7]
+    assert worst_images(gain, np.full(8, "a")) == list(range(6))  # one object: all are of it
+    assert worst_images(gain[:2], names[:2]) == [0, 1]
 
 
 def test_without_a_setup_the_page_says_how_to_name_it(made, tmp_path) -> None:

@@ -265,7 +265,7 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
     frames, kept = torch.rand(5, 24, 36), torch.tensor([[1.0, 1, 1, 1, 1], [1, 0, 1, 0, 0]])
     white = torch.eye(200, dtype=torch.float64) + 0.03 * torch.randn(200, 200, dtype=torch.float64)
     other = deepcopy(solver)
-    other._take(
+    other.take_components(
         other.basis, other.light, other.along, other.static.diag().double(), white
     )  # the noise of one component is then no longer that of another
 
@@ -546,7 +546,7 @@ def test_captures_correct_the_light_path_that_frames_are_solved_through(solved, 
         light = truth[own].flatten(1) @ fitted.light.flatten(1).T
         away = (
             (wrong[own] - fitted.ambient).flatten(1) @ fitted.basis
-            - fitted._terms(places[own]) @ fitted.along
+            - fitted.terms_along(places[own]) @ fitted.along
             - light
         )
         return float((away - away.mean(dim=0)).square().mean())

@@ -49,7 +49,7 @@ def test_presets_have_their_numbers() -> None:
 
 
 def test_links_into_the_repository_lead_to_pages() -> None:
-    found = site_pages._link
+    found = site_pages.site_link
     pattern = r"\]\(([^)#\s]+)(#[^)]*)?\)"
     link = re.search(pattern, "[x](../examples/02_diffuse_kernel.py)")
     assert link and found(link, "README.md", "") == "](gallery/02_diffuse_kernel.md)"

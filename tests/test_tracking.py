@@ -617,7 +617,9 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
     """Motion found gives an image near that of motion stated, and the confidence that goes with it."""
     folder, setup = capture
     # The network is untrained, and its light anything: let the setup move its images all the same.
-    monkeypatch.setattr("evnlos.analysis.model._SAME_LIGHT", (0.0, np.inf))
+    monkeypatch.setattr(
+        "evnlos.analysis.Reconstruction.is_moved", property(lambda found: found.light is not None)
+    )
     sampling = Sampling(height=24, width=36, scored_rows=18)
     torch.manual_seed(0)
     network = SequenceConfig(width=4, depth=1, rank=4).build("frame", sampling).eval()

@@ -10,7 +10,7 @@ import pytest
 
 from evnlos.calibration import Calibration, CaptureSet, fit_setup, steps_table
 from evnlos.calibration.captures import grouped, wall_data
-from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
+from evnlos.calibration.wall_fit import FREEDOMS, Unknowns, WallState, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
 from evnlos.calibration.wall_search import fit_wall, travelled
 from evnlos.data import Capture, CaptureInfo
@@ -211,7 +211,7 @@ def test_normal_equations_are_those_of_the_residual(rendered):
     pose = Pose(target_offset_m=(-0.17, 0.0))
     state, left = start_at(data, pose)
     assert 0 < left < 0.5
-    unknowns = _Unknowns(FREEDOMS, state, pose)
+    unknowns = Unknowns(FREEDOMS, state, pose)
     column, count, size = unknowns.column, unknowns.count, unknowns.size
     now = state.residual(data)
     gram, right = normal_equations(data, state, unknowns, now)

@@ -74,7 +74,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Fill in what comments ask for, lead links to pages of the site, part lists from text."""
     depth = "../" * page.file.src_uri.count("/")
     text = re.sub(r"<!-- (\w+)(?:: (.*?))? -->", lambda found: _filled(found, depth), markdown)
-    text = re.sub(r"\]\(([^)#\s]+)(#[^)]*)?\)", lambda found: _link(found, page.file.src_uri, depth), text)
+    text = re.sub(r"\]\(([^)#\s]+)(#[^)]*)?\)", lambda found: site_link(found, page.file.src_uri, depth), text)
     return lists_apart(text)
 
 
@@ -93,7 +93,7 @@ def _filled(found: re.Match[str], depth: str) -> str:
     return make(found[2]) if make else found[0]
 
 
-def _link(found: re.Match[str], source: str, depth: str) -> str:
+def site_link(found: re.Match[str], source: str, depth: str) -> str:
     """Return a Markdown link's end with its target in the site."""
     target, anchor = found[1], found[2] or ""
     if "://" in target or target.startswith(("mailto:", "data:")):

@@ -66,6 +66,18 @@ class Registry(Generic[T]):
         self._classes[kind] = cls  # type: ignore[assignment]
         return cls
 
+    def unregister(self, kind: str) -> None:
+        """Forget a kind that was registered, so that another class can have its name.
+
+        Args:
+            kind: Its name.
+
+        Raises:
+            UnknownNameError: There is no such kind; the nearest is named.
+        """
+        self.check(kind)
+        self._classes.pop(kind, None)
+
     def __getitem__(self, kind: str) -> T:
         if isinstance(kind, str) and kind in self._classes:
             return self._classes[kind]

@@ -273,13 +273,18 @@ def _maps(events: Sequence[Events], edges: list[NDArray[np.int64]], sampling: Sa
     """Return the counts and the surfaces of all recordings, one after the other."""
     pairs = list(zip(events, edges, strict=True))
     return {
-        "counts": np.concatenate([_block_counts(e, instants) for e, instants in pairs]),
+        "counts": np.concatenate([block_counts(e, instants) for e, instants in pairs]),
         "surfaces": np.concatenate([_surfaces(e, instants, sampling) for e, instants in pairs]),
     }
 
 
-def _block_counts(events: Events, edges_us: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return the mean events per pixel in blocks of the sensor between two instants, float32 [N, 2, h, w]."""
+def block_counts(events: Events, edges_us: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the mean events per pixel in blocks of 5 x 5 pixels between two instants, float32 [N, 2, h, w].
+
+    Args:
+        events: The events; ON is the first of the two maps.
+        edges_us: Instants, ascending, microseconds, [N + 1]; an event at an instant belongs to what ends there.
+    """
     bins = len(edges_us) - 1
     when = np.searchsorted(edges_us, events.t_us, side="left") - 1
     inside = (when >= 0) & (when < bins)

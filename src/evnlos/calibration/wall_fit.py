@@ -207,7 +207,7 @@ class Progress:
         return EFFECTIVE * math.log(self.left) + self.prior
 
 
-class _Unknowns:
+class Unknowns:
     """Where the numbers of a fit stand in its vector: pose, slopes, sensitivity, matte part.
 
     Args:
@@ -269,7 +269,7 @@ def refine(
         freedoms: Numbers of the pose that move.
         iterations: Most steps.
     """
-    unknowns = _Unknowns(freedoms, state, prior)
+    unknowns = Unknowns(freedoms, state, prior)
     power = float((data.shared_removed(data.seen) ** 2 * data.weight[:, None]).sum())
     now, damping, evaluations = state.residual(data), 1e-2, 0
     for round_ in range(1, iterations + 1):
@@ -314,7 +314,7 @@ def uncertainty(
         prior: See `refine`.
         freedoms: Numbers of the pose that were fitted.
     """
-    unknowns = _Unknowns(freedoms, state, prior)
+    unknowns = Unknowns(freedoms, state, prior)
     now, scores = state.residual(data), []
     gram, _ = normal_equations(data, state, unknowns, now, scores)
     temper = EFFECTIVE / float((now**2).sum())
@@ -327,7 +327,7 @@ def uncertainty(
 
 
 def normal_equations(
-    data: WallData, state: WallState, unknowns: _Unknowns, now: Array, scores: list[Array] | None = None
+    data: WallData, state: WallState, unknowns: Unknowns, now: Array, scores: list[Array] | None = None
 ) -> tuple[Array, Array]:
     """Return J^T W J [M, M] and J^T W r [M], with the rows free of what the captures share.
 

@@ -74,7 +74,7 @@ def check_capture(capture: Capture) -> list[Finding]:
         cure = "a network of frames needs none; for fusion and a finer track record an event camera beside it"
         alone = Finding("events", "doubtful", "none: a frame camera alone", cure)
         return [*_light(capture), *_movement(capture), *_motion(capture), alone, *_frame_times(capture)]
-    looks = (_light, _movement, _motion, _events, _flicker, _clock, _frame_times, _offset)
+    looks = (_light, _movement, _motion, _events, _flicker, _clock, _frame_times, clock_offset)
     return [finding for look in looks for finding in look(capture)]
 
 
@@ -249,8 +249,12 @@ def _frame_times(capture: Capture) -> Iterator[Finding]:
         yield Finding("repeated frames", "bad", found, cure)
 
 
-def _offset(capture: Capture) -> Iterator[Finding]:
-    """Compare the course of the light in the frames with the events: offset, and order of the frames."""
+def clock_offset(capture: Capture) -> Iterator[Finding]:
+    """Compare the course of the light in the frames with the events: offset, and order of the frames.
+
+    Args:
+        capture: A capture with frames and events; where they tell nothing of each other there is no finding.
+    """
     lag = find_lag(capture.events, capture.frames, capture.frame_times_us)
     if lag is None:
         return

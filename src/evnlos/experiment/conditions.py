@@ -248,7 +248,7 @@ def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
             told = _of_frames(blurred, references[0], setup, camera, few)
             tried.append((prior.error(told[0]), camera))
     camera = min(tried, key=lambda one: one[0])[1]
-    unknown = () if condition.is_motion_known else _motions(light, references, asked)
+    unknown = () if condition.is_motion_known else motion_unknowns(light, references, asked)
     lights = unknown or [light] * len(references)
     law = _PIXEL.crossing_law(light.typical_dn)
     found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in EVIDENCE}
@@ -257,7 +257,7 @@ def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
         frames = _of_frames(seen.exposed(camera.exposure_s), z, setup, camera, asked)
         events = bounds.event_information(seen, z, law, asked, (_CROSSING_NOISE,))[0][0]
         for name, information in zip(EVIDENCE, (frames, events, frames + events), strict=True):
-            found[name].append(np.stack([_known(one, prior.count) for one in information]))
+            found[name].append(np.stack([marginal_information(one, prior.count) for one in information]))
     expected = {
         name: tuple(
             round(bounds.canvas_decibel(float(np.mean([prior.error(r[n]) for r in each])), _CELLS), 3)
@@ -298,13 +298,13 @@ def _of_frames(
     return bounds.frame_information(light, z, replace(setup, frame_camera=camera.per_light()), asked)
 
 
-def _known(information: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def marginal_information(information: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Return what is known of the target alone, [k, k], where further unknowns of variance 1 are left open."""
     target, mixed, rest = information[:count, :count], information[:count, count:], information[count:, count:]
     return target - mixed @ np.linalg.solve(np.eye(len(rest)) + rest, mixed.T) if len(rest) else target
 
 
-def _motions(
+def motion_unknowns(
     light: SequenceLight, references: Sequence[NDArray[np.float64]], asked: bounds.SequenceAnalysisSettings
 ) -> list[SequenceLight]:
     """Return the light with two more patterns: what place and speed change of each reference's light."""

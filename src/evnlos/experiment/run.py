@@ -203,7 +203,7 @@ def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> l
     threads = max(1, torch.get_num_threads() // at_once)
     tasks = [*(partial(_trained, run) for run in runs), *(partial(_scored, network) for network in networks)]
     records, done, scored = list[Record](), 0, 0
-    within = partial(_epochs_at_work, runs)
+    within = partial(epochs_at_work, runs)
     progress(Step("train networks", 0, len(runs), "networks", within=within))
     with closing(run_tasks(partial(_called, threads), tasks, at_once, after)) as finished:
         for name, found in finished:
@@ -220,8 +220,8 @@ def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> l
     return sorted(records, key=lambda r: order.get((r.arm, r.modality), len(order)))
 
 
-def _epochs_at_work(runs: Sequence[Run]) -> tuple[float, str]:
-    """Return how many networks the unfinished trainings amount to, and their epochs in words."""
+def epochs_at_work(runs: Sequence[Run]) -> tuple[float, str]:
+    """Return how many networks the unfinished ones of `runs` amount to, and their epochs in words."""
     part, words = 0.0, list[str]()
     for run in runs:
         if run.out.is_dir() and not (run.out / "weights.safetensors").is_file():

@@ -232,7 +232,7 @@ class Reconstructor(nn.Module, ABC):
         return name
 
 
-_LAMBDAS = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean power of a component
+RIDGES = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean power of a component
 _FOLDS = 5
 _EXTRA = 20  # columns of the random probe beyond the rank
 _POWERS = 2
@@ -360,13 +360,13 @@ def _regress(code: Tensor, y: Tensor, folds: Tensor) -> tuple[Tensor, Tensor, Te
         part = code[own]
         parts.append(((part.T @ part).double(), (part.T @ y[own]).double()))
     gram, outer = (torch.stack(column).sum(dim=0) for column in zip(*parts, strict=True))
-    errors = sum(_left_out(gram - own, outer - aim, own, aim) for own, aim in parts)
-    regularization = _LAMBDAS[int(torch.as_tensor(errors).argmin())]
+    errors = sum(left_out_errors(gram - own, outer - aim, own, aim) for own, aim in parts)
+    regularization = RIDGES[int(torch.as_tensor(errors).argmin())]
     weights = outer.float() / (powers + regularization * powers.mean().clamp_min(_TINY))[:, None]
     return turn, powers, weights, regularization
 
 
-def _left_out(gram: Tensor, outer: Tensor, left_gram: Tensor, left_outer: Tensor) -> Tensor:
+def left_out_errors(gram: Tensor, outer: Tensor, left_gram: Tensor, left_outer: Tensor) -> Tensor:
     """Return the squared error on samples left out, less their sum |Y|^2, for each ridge, float64.
 
     In the eigenvectors of the other samples' Gram matrix each ridge is a diagonal, and ||C W - Y||^2 needs no
@@ -383,7 +383,7 @@ def _left_out(gram: Tensor, outer: Tensor, left_gram: Tensor, left_outer: Tensor
     turned = turn.T @ outer  # [R, H W]
     aimed = (turned * (turn.T @ left_outer)).sum(dim=1)
     square = (turn.T @ left_gram @ turn) * (turned @ turned.T)
-    ridges = torch.tensor(_LAMBDAS, dtype=torch.float64) * powers.mean().clamp_min(_TINY)
+    ridges = torch.tensor(RIDGES, dtype=torch.float64) * powers.mean().clamp_min(_TINY)
     inverse = 1 / (powers + ridges[:, None])  # [ridges, R]
     return ((inverse @ square) * inverse).sum(dim=1) - 2 * inverse @ aimed
 

@@ -179,7 +179,7 @@ class PooledFrames(nn.Module):
         gain = mean_of((moving * seen).sum(dim=1)) / mean_of(moving.square().sum(dim=1)).clamp_min(1e-12)
         left = code - gain[owner, None] * clean
         self.reach.copy_(torch.stack([position_m.amin(dim=0), position_m.amax(dim=0)]))
-        terms = self._terms(position_m)
+        terms = self.terms_along(position_m)
         along = _polynomial(terms, left)
         left = left - terms @ along
         offset = mean_of(left)
@@ -193,7 +193,7 @@ class PooledFrames(nn.Module):
         self.ambient.copy_(ambient)
         light = torch.zeros(kept, *operator.size)
         light[:, rows] = carry.T.unflatten(1, (-1, operator.size[1]))
-        self._take(basis, light, along, shifts.T @ shifts / count, white)
+        self.take_components(basis, light, along, shifts.T @ shifts / count, white)
         prior = handwritten_prior(self.target_plane, _COEFFICIENTS, ink=setup.ink)
         self.mean.copy_(torch.from_numpy(prior.mean).unflatten(0, self.target_plane.shape))
         self.patterns.copy_(torch.from_numpy(prior.patterns.T.copy()).unflatten(1, self.target_plane.shape))
@@ -217,7 +217,7 @@ class PooledFrames(nn.Module):
         if len(found) < _FEWEST_CAPTURES:
             return
         some = torch.arange(0, len(owner), math.ceil(len(owner) / _MOST_FRAMES))
-        group, terms = torch.from_numpy(owner)[some], self._terms(position_m[some])
+        group, terms = torch.from_numpy(owner)[some], self.terms_along(position_m[some])
         shown = truth[some].float().flatten(1)
         code = (frames[some].float() - self.ambient).flatten(1) @ self.basis
         steady = F.normalize(F.one_hot(group).float(), dim=0)  # a column a capture
@@ -230,10 +230,12 @@ class PooledFrames(nn.Module):
         self.along.copy_(_polynomial(terms, code - gain * (shown @ self.light.flatten(1).T)))
         variance, turn = torch.linalg.eigh(missed.T @ missed / len(missed))
         white = (turn / variance.clamp_min(1.0).sqrt()) @ turn.T
-        self._take(self.basis, self.light, self.along, self.static.diag().double(), white)
+        self.take_components(self.basis, self.light, self.along, self.static.diag().double(), white)
         self._last.clear()
 
-    def _take(self, basis: Tensor, light: Tensor, along: Tensor, offsets: Tensor, white: Tensor) -> None:
+    def take_components(
+        self, basis: Tensor, light: Tensor, along: Tensor, offsets: Tensor, white: Tensor
+    ) -> None:
         """Take components W c [k] of components c, turned so that their offsets are independent.
 
         Args:
@@ -293,7 +295,7 @@ class PooledFrames(nn.Module):
 
     def errors(self, frames: Tensor, truth: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
         """Return by how much scores miss, [K, k], where the truth on the canvas is known: [N, H, W]."""
-        light = truth.float().flatten(1) @ self.light.flatten(1).T + self._terms(position_m) @ self.along
+        light = truth.float().flatten(1) @ self.light.flatten(1).T + self.terms_along(position_m) @ self.along
         away = (frames.float() - self.ambient).flatten(1) @ self.basis - light
         return self.statistic(away, position_m, kept)[1]
 
@@ -306,7 +308,7 @@ class PooledFrames(nn.Module):
             kept: As of `forward`.
         """
         rows, known, _ = self._rows(position_m)
-        away = self._terms(position_m) @ self.along - known
+        away = self.terms_along(position_m) @ self.along - known
         information, base = self.statistic(away, position_m, kept)
         carrier = MatrixTransport(self.light.flatten(1), self.sampling.canvas, (1, len(self.light)))
         seen = torch.zeros(len(kept), len(self.light), plane.height * plane.width)
@@ -335,15 +337,19 @@ class PooledFrames(nn.Module):
             carrier = MatrixTransport(self.light.flatten(1), self.sampling.canvas, (1, len(self.light)))
             seen = SequenceOperator(carrier, self.target_plane, position_m.cpu().double().numpy()).matrix()
             rows = (seen @ self.patterns.flatten(1).T).mT.double()  # [N, k, r]; sums lose digits in float32
-            known = self._terms(position_m) @ self.along + seen @ self.mean.flatten()
+            known = self.terms_along(position_m) @ self.along + seen @ self.mean.flatten()
             self._last[key] = rows, known, rows @ rows.mT
             while len(self._last) > _KEPT_ROWS:
                 self._last.popitem(last=False)
         self._last.move_to_end(key)
         return self._last[key]
 
-    def _terms(self, position_m: Tensor) -> Tensor:
-        """Return the terms of the polynomial, [N, 7]; a place beyond all that were seen is the nearest one."""
+    def terms_along(self, position_m: Tensor) -> Tensor:
+        """Return the terms of the polynomial, [N, 7]; a place beyond all that were seen is the nearest one.
+
+        Args:
+            position_m: The target's centres, (x, y) in metres, [N, 2].
+        """
         low, high = self.reach
         at = position_m.to(self.reach).clamp(low, high)
         x, y = ((at - (low + high) / 2) / ((high - low) / 2).clamp_min(1e-6)).unbind(dim=1)

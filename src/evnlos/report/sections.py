@@ -66,7 +66,7 @@ def limits_section(found: Identification | None) -> str:
     if found is None:
         return ""
     at = found.at_camera
-    spectrum, picard = _points(at.spectrum), _points(at.picard)
+    spectrum, picard = spectrum_points(at.spectrum), spectrum_points(at.picard)
     noise = [(1.0, 0.0), (max(x for x, _ in [(2.0, 0.0), *spectrum, *picard]), 0.0)]
     series = {"singular value / noise": spectrum, "a letter's coefficient / noise": picard, "noise": noise}
     pictures = "".join(
@@ -86,8 +86,12 @@ def limits_section(found: Identification | None) -> str:
     )
 
 
-def _points(values: torch.Tensor) -> list[tuple[float, float]]:
-    """Return number and logarithm of each value up to the last one that stands above the lowest drawn."""
+def spectrum_points(values: torch.Tensor) -> list[tuple[float, float]]:
+    """Return number and logarithm of each value up to the last one that stands above the lowest drawn.
+
+    Args:
+        values: Singular values, or coefficients of a target, over the noise, [K].
+    """
     above = np.flatnonzero(values.numpy() > _LOWEST)
     last = int(above[-1]) + 1 if len(above) else 0
     logs = np.log10(np.maximum(values.numpy()[:last], _LOWEST))
@@ -293,7 +297,7 @@ def failures_section(results: list[RunResult]) -> str:
         blank = found.baselines.get("mean", found.baselines["zero"])
         gain = found.scores.psnr_db - blank.psnr_db
         cells = []
-        for k in _worst(gain, found.names):
+        for k in worst_images(gain, found.names):
             name = str(found.names[k])
             position = int(np.flatnonzero(found.names == name).searchsorted(k))
             pair = data_uri(png(strip([grey(found.truth[k]), grey(found.images[k])], 1)))
@@ -314,8 +318,13 @@ def failures_section(results: list[RunResult]) -> str:
     )
 
 
-def _worst(gain: np.ndarray, names: np.ndarray) -> list[int]:
-    """Return the samples that gain least, spread over the objects: one object's would look the same."""
+def worst_images(gain: np.ndarray, names: np.ndarray) -> list[int]:
+    """Return the samples that gain least, spread over the objects: one object's would look the same.
+
+    Args:
+        gain: Gain of each over the mean image, dB, [N].
+        names: Object of each, [N].
+    """
     each = max(2, -(-_WORST // len(np.unique(names))))
     taken: list[int] = []
     for k in np.argsort(gain, kind="stable"):

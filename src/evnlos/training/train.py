@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -53,7 +52,6 @@ from evnlos.training.source import (
 )
 from evnlos.types import derive_seed
 
-_LOG = logging.getLogger("evnlos")
 _CHECKPOINT_S = 5.0  # a checkpoint after the first epoch, then no more often: it may take longer than an epoch
 
 

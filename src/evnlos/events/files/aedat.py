@@ -211,14 +211,12 @@ class Aedat2Source:
             yield times, np.zeros(len(times), np.uint8), np.ones(len(times), np.bool_)
 
 
-COUNTS, FIRST = slice(3, 5), 5  # further slots: samples of each kind, time of the first signal sample
-
-
 @njit(cache=True)
 def _sample(pairs, start, state, samples, seen):
     """Take frame samples; return the number of the pair behind a complete frame, or -1 at the end of the block.
 
-    `samples` and `seen` are [2, H, W]: the level after reset, then the level after the exposure.
+    `samples` and `seen` are [2, H, W]: the level after reset, then the level after the exposure. Slots 3 and 4
+    of `state` count the samples of each kind, slot 5 is the time of the first one after the exposure.
     """
     height, width = samples.shape[1:]
     for index in range(start, len(pairs) // 2):

@@ -32,7 +32,6 @@ from evnlos.untrusted import ElsewhereError, check_memory, open_hdf5, stored
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _MOST_CHUNK_BYTES = 1 << 26
-_NAMES = {"t_us": "t", "x": "x", "y": "y", "p": "p"}
 _ALIASES = {
     "t_us": ("t", "ts", "t_us", "timestamps"),
     "x": ("x", "xs", "xy"),
