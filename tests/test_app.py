@@ -245,8 +245,11 @@ def test_a_server_refuses_what_cannot_be() -> None:
 
 def test_without_gradio_the_page_says_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "gradio", None)
-    with pytest.raises(MissingDependencyError, match=r"evnlos\[app\]"), running(Server(port=0)):
+    steps = list[machine.Step]()
+    failing = running(Server(port=0), progress=steps.append)
+    with pytest.raises(MissingDependencyError, match=r"evnlos\[app\]"), failing:
         pass
+    assert [(step.done, step.total, step.within) for step in steps] == [(0, 3, "libraries")]
 
 
 @pytest.mark.parametrize(("host", "is_open"), [("127.0.0.1", False), ("localhost", False), ("0.0.0.0", True)])
@@ -439,7 +442,7 @@ import contextlib, tempfile, time
 from evnlos.app import serve
 
 @contextlib.contextmanager
-def starting(server, weights):
+def starting(server, weights, progress):
     with tempfile.TemporaryDirectory(prefix="evnlos-app-"):
         print("starting", flush=True)
         time.sleep(60)

@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from evnlos.errors import ConfigError, MissingDependencyError
-from evnlos.machine import listening_address
+from evnlos.machine import Progress, Step, listening_address, silent
 from evnlos.untrusted import is_local, names_this_machine
 
 # The browser itself refuses what would leave this server.
@@ -262,13 +262,19 @@ class Server:
             raise ConfigError(f"proxy is {self.proxy!r}; give an address such as https://nlos.example.org")
 
 
-def serve(server: Server, weights: tuple[Path, ...] = (), ready: Callable[[str], None] | None = None) -> None:
+def serve(
+    server: Server,
+    weights: tuple[Path, ...] = (),
+    ready: Callable[[str], None] | None = None,
+    progress: Progress = silent,
+) -> None:
     """Run the page until it is interrupted; uploads live in a folder that is deleted then.
 
     Args:
         server: Where.
         weights: Weights files, or folders of runs.
         ready: Called with the page's address once it can be opened.
+        progress: Called with what is at work until then.
 
     Raises:
         MissingDependencyError: Gradio is not installed.
@@ -284,7 +290,7 @@ def serve(server: Server, weights: tuple[Path, ...] = (), ready: Callable[[str],
 
     previous = signal.signal(signal.SIGTERM, end)
     try:
-        with running(server, weights) as address:
+        with running(server, weights, progress) as address:
             if ready is not None:
                 ready(address)
             with suppress(KeyboardInterrupt):
@@ -297,9 +303,13 @@ def serve(server: Server, weights: tuple[Path, ...] = (), ready: Callable[[str],
         signal.signal(signal.SIGTERM, previous)
 
 
+_OPENING = "open the page"
+
+
 @contextmanager
-def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
+def running(server: Server, weights: tuple[Path, ...] = (), progress: Progress = silent) -> Iterator[str]:
     """Yield the address of the running page, and stop it afterwards. Arguments and errors as in `serve`."""
+    progress(Step(_OPENING, 0, 3, "stages", within="libraries"))
     os.environ.update(_QUIET)
     own = server.host if is_local(listening_address(server.host, server.port)) else None
     if own is None:
@@ -316,6 +326,7 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     from evnlos.app.page import build_page, simulated, theme
     from evnlos.app.solving import own_networks
 
+    progress(Step(_OPENING, 1, 3, "stages", within="the first images"))
     networks = own_networks(weights)
     controls = Controls(columns=server.columns)
     pieces = simulated(controls, picked("R"), networks, link_of(controls, "R"))
@@ -325,6 +336,7 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     # The verdict on the first setup takes seconds until all is compiled: it is made while the page loads.
     threading.Thread(target=lambda: list(pieces), daemon=True).start()
     limit = round(1e6 * server.upload_mb)
+    progress(Step(_OPENING, 2, 3, "stages", within="its layout"))
     with tempfile.TemporaryDirectory(prefix="evnlos-app-", ignore_cleanup_errors=True) as scratch:
         os.environ["GRADIO_TEMP_DIR"] = scratch
         page = build_page(gradio, first, controls, networks, Path(scratch), limit)
@@ -361,6 +373,7 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
                 f"cannot listen on {server.host} port {server.port or '7860 to 7959'}; give another --port"
             ) from None
         try:
+            progress(Step(_OPENING, 3, 3, "stages"))
             yield address
         finally:
             page.close(verbose=False)

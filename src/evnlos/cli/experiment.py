@@ -290,8 +290,8 @@ class AppCommand:
 
     def run(self) -> None:
         """Run the page until it is interrupted."""
-        say("starting: the first images are computed before the page opens, about 20 s")
-        serve(self.server, self.weights, lambda address: print(f"{address}  (Ctrl+C stops it)", flush=True))
+        with ProgressBars() as progress:
+            serve(self.server, self.weights, lambda at: print(f"{at}  (Ctrl+C stops it)", flush=True), progress)
         say("stopped")  # while compiled code may be at work still, which the interpreter would tear apart
         sys.stdout.flush()
         os._exit(0)
