@@ -176,7 +176,7 @@ def check_walls(shape: tuple[int, int] = (8, 12), samples: int = 128) -> dict[st
 
 
 if __name__ == "__main__":
-    print("wall                  traced / computed      chi2 (1 = noise only)   tracer's noise a pixel")
+    print("wall                  traced / computed      chi2 (1 = noise only)   tracer's noise per pixel")
     for wall, one in check_walls().items():
         print(
             f"{wall:<20}  {one.gain:.5f} +- {one.gain_sigma:.5f}    {one.chi2:.2f} +- {one.chi2_sigma:.2f}"

@@ -58,7 +58,7 @@ def sequences(
 ) -> NlosDataset:
     """Return sequences of objects of 4 x 4 random squares, seen with noise of their own at each position.
 
-    `share` of what tells objects apart is seen; the rest is the average object.
+    `share` of what distinguishes objects is seen; the rest is the average object.
     """
     draw = torch.Generator().manual_seed(seed)
     x = np.linspace(-0.07, 0.07, positions)

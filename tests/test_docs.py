@@ -146,6 +146,24 @@ def test_files_that_pages_name_exist() -> None:
             assert any(path == name or path.endswith(f"/{name}") for path in there), f"{page.name}: {name}"
 
 
+def test_no_pattern_on_a_page_names_a_capture_that_the_page_only_began() -> None:
+    """`import captures/*` takes every folder: what `capture init` makes there holds no recording yet."""
+    begun, wrong = 0, []
+    for page in PAGES:
+        commands = [command.split()[1:] for command in commands_on(page)]
+        folders = [words[2] for words in commands if words[:2] == ["capture", "init"] and len(words) > 2]
+        begun += len(folders)
+        wrong += [
+            f"{page.name}: {words[0]} {word} names {folder}"
+            for folder in folders
+            for words in commands
+            for word in words
+            if "*" in word and Path(folder).match(word)
+        ]
+    assert begun >= 5
+    assert not wrong
+
+
 def test_a_page_on_recordings_that_nobody_can_have_says_how_to_make_their_like() -> None:
     pages = {path: path.read_text() for path in (*DOCS.glob("*.md"), DOCS.parent / "README.md")}
     cites = {path for path, text in pages.items() if re.search(r"captures/(near|far)_|--captures-of", text)}

@@ -7,11 +7,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-UNITS = "(?:second|pixel|position|step|image|object|capture|shot|frame|sample|event|sequence|setup|row|unit)"
-RATES = "(?:events?|Hz|hertz|metres?|seconds?|s|ms|us|ns|kB|MB|GB|dB|bytes|steps|frames|samples|dots|shard)"
+UNITS = (
+    "(?:second|pixel|position|step|image|(?:hidden )?object|capture|shot|frame|sample|event|sequence|setup|row"
+    "|unit)"
+)
+RATES = "(?:events?|Hz|hertz|metres?|seconds?|[mun]?s|mm|chi2|noise|[kMG]B|dB|bytes|steps|frames|samples|dots|shard)"
 BANNED = {
     "rightly": "correctly",
     "told apart": "distinguished",
+    "tells? objects apart": "distinguishes objects",
+    r"\bshots/": "captures/",
     r"(?:is|are) asked(?! for| of|\b.{0,3}(?:to|again))": "is required",
     "not at home": "unreliable",
     "of those that": "name them",
@@ -84,6 +89,11 @@ def test_the_ban_finds_what_it_is_for() -> None:
         "70 are asked",
         "it were 0.5 dB ahead",
         "3 ms a position",
+        "2 mm a pixel",
+        "chi2 a pixel",
+        "one shard a hidden object",
+        "what tells objects apart",
+        "import shots/lab_*",
     ]
     for sentence in sentences:
         assert any(re.search(word, sentence, re.IGNORECASE) for word in BANNED), sentence

@@ -1,6 +1,8 @@
 """The page to mail: setup, films, failures, limits and origin, small and without requests."""
 
+import base64
 import html
+import io
 import re
 import shlex
 from dataclasses import replace
@@ -11,10 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from chromium import Chromium, missing
 from evnlos.analysis import AnalysisSettings, Evaluation, identify, score
 from evnlos.analysis.confidence import ConfidenceCheck
+from evnlos.analysis.identify import GUESSED
 from evnlos.cli import main
 from evnlos.cli.main import command_of
 from evnlos.config import save_yaml
@@ -23,9 +27,9 @@ from evnlos.plot.setup import PARTITION, setup_drawing
 from evnlos.report import RunResult, seen_in_training, write_report
 from evnlos.report.pictures import curves_svg
 from evnlos.report.provenance import Commands
-from evnlos.report.sections import gains_of, setup_section, spectrum_points, worst_images
+from evnlos.report.sections import gains_of, lead_section, setup_section, spectrum_points, worst_images
 from evnlos.report.tables import named
-from evnlos.setups import PaperSetup, RadiometricSetup, lit_setup, named_setup, setup_preset
+from evnlos.setups import PaperSetup, RadiometricSetup, lit_setup, load_setup, named_setup, setup_preset
 
 POSITIONS = 12
 
@@ -301,6 +305,45 @@ def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:
 
 def _unmeasured(name: str) -> ConfidenceCheck:
     return ConfidenceCheck(name, 0.0, 0.01, None, False, -0.3, 0.99, 1.0)
+
+
+def test_the_page_leads_with_three_objects_and_the_verdict(made, tmp_path) -> None:
+    """The best, the median and the worst object, truth beside image, and one verdict; tables are folded."""
+    data, runs = made
+    limits = identify(load_setup("main-near"), AnalysisSettings(cells=8, height=12, width=20, writers=1))
+    page = html.unescape(write_report(tmp_path / "report.html", data, runs, [], limits=limits).read_text())
+    lead = page.split("</h1>")[1].split("<p class=dim>evnlos ")[0]
+    assert re.findall(r"<figcaption>(\w+): (\w), ", lead) == [("best", "G"), ("worst", "K")]
+    assert f"{limits.wall[1:]}.</b>" in lead and GUESSED[None][1:] in lead
+    # Of three objects there is a median; truth is on the left.
+    first = runs[0].evaluation
+    k = np.arange(3 * POSITIONS) % len(first.truth)
+    levels = torch.tensor([0.5, 0.9, 0.7]).repeat_interleave(POSITIONS)[:, None, None]
+    image, truth, names = (
+        levels * first.truth[k],
+        first.truth[k],
+        np.repeat(["near_1", "near_2", "near_3"], POSITIONS),
+    )
+    said = [ConfidenceCheck("near_1", 0.6, 0.7, 0.6, True, 0.8, 0.9, 0.2)] * 2 + [_unmeasured("near_3")]
+    run = replace(runs[0], evaluation=Evaluation(image, truth, names, score(image, truth), {}))
+    for checks, words in ((said, (GUESSED[True], GUESSED[False])), (said[:2], (GUESSED[True],))):
+        one = replace(run, evaluation=replace(run.evaluation, confidence_checks=checks))
+        lead = html.unescape(lead_section([one], None))
+        assert re.findall(r"(\w+): (\w), [\d.]+ dB</figcaption>", lead) == [
+            ("best", "2"),
+            ("median", "3"),
+            ("worst", "1"),
+        ]
+        assert f"f 2 of {len(checks)} sequences something was measured" in lead
+        assert [one for one in GUESSED.values() if one[1:] in lead] == list(words)
+    shown = re.search(r"src='data:image/png;base64,([^']+)'", lead)[1]
+    pair = np.asarray(Image.open(io.BytesIO(base64.b64decode(shown))).convert("L"))
+    assert pair[:, :48].max() == 255 and pair[:, -48:].max() in (229, 230)
+    # What is folded is closed, and all tables are but that of PSNR.
+    open_page = re.sub(r"<details>.*?</details>", "", page, flags=re.DOTALL)
+    assert "<details open" not in page and open_page.count("<table") == 1 < page.count("<table")
+    assert "class=strips" in page and "class=strips" not in open_page
+    assert "<table" in open_page.split("<h2>PSNR, dB</h2>")[1].split("<h2>")[0]
 
 
 def test_the_worst_images_are_of_several_objects() -> None:

@@ -353,7 +353,7 @@ def aligned(cells: list[list[str]]) -> str:
 
 
 def matching_paths(given: Iterable[str | Path]) -> list[Path]:
-    """Return paths in which a pattern, such as shots/*, stands for what it matches, as most shells have it.
+    """Return paths in which a pattern, such as captures/*, stands for what it matches, as most shells have it.
 
     Args:
         given: Paths and patterns; what is there is no pattern, and a pattern that matches nothing stays.

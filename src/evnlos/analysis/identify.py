@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,6 +16,7 @@ from evnlos.analysis.linearized import (
     AnalysisSettings,
     LinearEstimator,
     LinearizedSetup,
+    artifact_note,
     finest_bars,
     linearized,
     scan_notes,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from evnlos.models import ConfidenceReport
 
 _SHAPE = 4  # bars of a quarter of the target plane tell where a letter is filled and where it is open
-_EXTRA_MODES = 1.1
 
 
 def verdict(
@@ -69,26 +69,6 @@ def verdict(
     else:
         meaning = "a legible reconstruction would come from the training data, not from the measurement"
     return f"From one frame of this wall {patterns} patterns can be distinguished, and {bars}: {meaning}."
-
-
-def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float) -> str | None:
-    """Return a warning where what a setup's model adds to a real wall shows modes that the wall does not have.
-
-    Args:
-        setup: The setup.
-        plain: The same without that (`Setup.without_artifacts`), e.g. a tPSF without its hard edge.
-        cut: Singular values of the setup above `level`.
-        whole: The same without the artifact.
-        level: Share of the largest singular value.
-    """
-    if cut <= _EXTRA_MODES * whole:
-        return None
-    changed = [item.name for item in fields(setup) if getattr(setup, item.name) != getattr(plain, item.name)]
-    here, there = (", ".join(f"{name} {getattr(one, name):g}" for name in changed) for one in (setup, plain))
-    return (
-        f"{setup.wall_description()} with {here}: {cut} singular values lie above {level:g} of the largest, "
-        f"{whole} with {there}; {setup.artifact} makes the operator look better conditioned than a wall is"
-    )
 
 
 MODE_LEVEL = 1e-2
@@ -199,10 +179,7 @@ class Identification:
 
 
 def identify(
-    setup: Setup,
-    settings: AnalysisSettings | None = None,
-    name: str = "setup",
-    seed: int = 0,
+    setup: Setup, settings: AnalysisSettings | None = None, name: str = "setup", seed: int = 0
 ) -> Identification:
     """Say what one image of the wall can show of a target at a known place, whatever the method.
 
@@ -275,6 +252,14 @@ QUICK = AnalysisSettings(cells=16, writers=2)
 """A coarse question, answered while one waits; `evnlos identify` asks the fine one."""
 
 
+GUESSED = {
+    True: "what the intervals leave open is the network's guess, from its training",
+    False: "the whole image is the network's guess",
+    None: "how much of the image is guessed cannot be told",
+}
+"""What of an image is guessed, by whether its sequence was measured; None: unknown."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """What to believe of a reconstruction: the same words in each command, on the page and in the files.
@@ -310,11 +295,8 @@ def verdict_on(
     except MissingDependencyError as error:  # of handwriting; the images stand without the answer
         wall = f"what the wall allows is not known: {error}"
     if report is None:
-        return Verdict(wall, no_confidence or "", "how much of the image is guessed cannot be told")
-    if not report.measured:
-        return Verdict(wall, report.verdict, "the whole image is the network's guess")
-    guessed = "what the intervals leave open is the network's guess, from its training"
-    return Verdict(wall, report.verdict, guessed)
+        return Verdict(wall, no_confidence or "", GUESSED[None])
+    return Verdict(wall, report.verdict, GUESSED[report.measured])
 
 
 def result_at_noise(

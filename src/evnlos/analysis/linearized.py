@@ -2,13 +2,13 @@
 
 - A setup as a matrix with a noise: what every question about its limits starts from.
 - The best linear estimate of a target from one image of the wall, and how wrong it is on average.
-- What a measured matrix can't say about a setup: its own noise and the size of its cells, in words.
+- What a matrix can't say about a setup, in words: what its model adds to a wall, a scan's noise and cells.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 
@@ -16,6 +16,8 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.machine import note
 from evnlos.setups import OperatorNoise, Setup
 from evnlos.types import Plane
+
+_EXTRA_MODES = 1.1
 
 
 @dataclass(frozen=True)
@@ -242,6 +244,26 @@ def finest_bars(estimator: LinearEstimator, cells: int, upright: bool = True) ->
             break
         found = width
     return found
+
+
+def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float) -> str | None:
+    """Return a warning where what a setup's model adds to a real wall shows modes that the wall does not have.
+
+    Args:
+        setup: The setup.
+        plain: The same without that (`Setup.without_artifacts`), e.g. a tPSF without its hard edge.
+        cut: Singular values of the setup above `level`.
+        whole: The same without the artifact.
+        level: Share of the largest singular value.
+    """
+    if cut <= _EXTRA_MODES * whole:
+        return None
+    changed = [item.name for item in fields(setup) if getattr(setup, item.name) != getattr(plain, item.name)]
+    here, there = (", ".join(f"{name} {getattr(one, name):g}" for name in changed) for one in (setup, plain))
+    return (
+        f"{setup.wall_description()} with {here}: {cut} singular values lie above {level:g} of the largest, "
+        f"{whole} with {there}; {setup.artifact} makes the operator look better conditioned than a wall is"
+    )
 
 
 def scan_notes(noise: OperatorNoise, seen: LinearizedSetup, singular: torch.Tensor, level: float) -> list[str]:

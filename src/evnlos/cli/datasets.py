@@ -46,7 +46,7 @@ from evnlos.types import OutFolder
 
 @dataclass(frozen=True)
 class SimulateCommand:
-    """Simulate a dataset: one shard a hidden object. Run it again to go on after an interruption."""
+    """Simulate a dataset: one shard per hidden object. Run it again to go on after an interruption."""
 
     PRESETS: ClassVar[Presets[Simulation]] = PRESETS
 

@@ -23,6 +23,8 @@ from evnlos.report.sections import (
     animations_section,
     belief_section,
     failures_section,
+    folded,
+    lead_section,
     limits_section,
     setup_section,
     strips_section,
@@ -175,6 +177,8 @@ def write_report(
     content = "\n".join(
         [
             page_head("evnlos report"),
+            "<h1>Around the corner: reconstructions of hidden moving objects</h1>",
+            lead_section(results, limits),
             _head(dataset, results, notes, split, words),
             setup_section(setup.name if setup else "", setup.setup if setup else None),
             summary_section(results),
@@ -214,10 +218,9 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
     )
     seen = f"{len(first.images)} images of {len(first.characters())} objects ({html.escape(objects)})"
     return (
-        "<h1>Around the corner: reconstructions of hidden moving objects</h1>"
         f"<p class=dim>evnlos {__version__} · {seen}, split “{html.escape(split)}”</p>{lines}"
-        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm a pixel; {psnr} is the mean over "
-        "the images of each image's PSNR with peak 1. The first columns are what one scores without "
+        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm per pixel; {psnr} is the mean "
+        "over the images of each image's PSNR with peak 1. The first columns are what one scores without "
         "looking: an all-black image, and the mean of the training images, then what pure memory scores. A "
         f"method that does not exceed them has learned nothing.{no_lpips}</p>"
         f"<p><b>{words.link('e2e')}</b>: trained on the captures alone. <b>{words.link('epnp')}</b>: "
@@ -245,10 +248,10 @@ def _table(results: list[RunResult], metric: str, title: str, unit: str, decimal
         kind = " class=mean" if character == "mean" else ""
         lines.append(f"<tr{kind}><td>{html.escape(group)} {html.escape(character)}</td>{cells}</tr>")
     heading = words.link(metric, title) + (f", {unit}" if unit else "")
-    return (
-        f"<h2>{heading}</h2><div class=wide><table><tr><th class=better>{better}</th>{heads}</tr>"
-        f"{''.join(lines)}</table></div>"
+    table = (
+        f"<div class=wide><table><tr><th class=better>{better}</th>{heads}</tr>{''.join(lines)}</table></div>"
     )
+    return f"<h2>{heading}</h2>{table if metric == 'psnr_db' else folded(f'Table of {title}', table)}"
 
 
 def _checks(results: list[RunResult]) -> str:
@@ -265,7 +268,7 @@ def _checks(results: list[RunResult]) -> str:
     return (
         "<h2>Read, or remembered?</h2><p class=dim>The reader is a small network trained on clean glyphs of "
         "other hands. “nearest neighbour” answers with the training object whose measurement is most alike.</p>"
-        f"<div class=wide><table><tr><th></th>{heads}</tr>{''.join(rows)}</table></div>"
+        + folded("Table", f"<div class=wide><table><tr><th></th>{heads}</tr>{''.join(rows)}</table></div>")
     )
 
 
@@ -322,10 +325,10 @@ def _optics(dataset: Dataset, results: list[RunResult]) -> str:
     ]
     if not lines:
         return ""
+    heads = "<tr><th>dataset</th><th></th><th></th></tr>"
     return (
         "<h2>Optics of the simulation</h2><p class=dim>Fresnel number of half a target; blur by diffraction "
         "and "
         "radius of the tPSF in camera pixels; distance up to which the sampled wave is true, in metres.</p>"
-        "<div class=wide><table><tr><th>dataset</th><th></th><th></th></tr>"
-        f"{''.join(lines)}</table></div>"
+        + folded("Table", f"<div class=wide><table>{heads}{''.join(lines)}</table></div>")
     )

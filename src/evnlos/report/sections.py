@@ -1,5 +1,6 @@
-"""Sections of a report: the setup, the summary, confidence, images over time steps.
+"""Sections of a report: what leads, the setup, the summary, confidence, images over time steps.
 
+- What a report leads with: the best, the median and the worst object, and the verdict in words.
 - The setup of a report: its drawing to scale, and what it can show at all.
 - The figure that a report leads with: what pre-training gains, beside what one scores without looking.
 - How far to believe the images: what each run said of its own sequences, beside what was true.
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 
 from evnlos.analysis import BASELINES
-from evnlos.analysis.identify import Identification
+from evnlos.analysis.identify import GUESSED, Identification, Verdict
 from evnlos.analysis.scores import Interval, paired_difference
 from evnlos.data import Dataset, character_of, modality_order, read_shard
 from evnlos.events.volume import WORDS
@@ -24,6 +25,60 @@ from evnlos.report.tables import METHODS, RunResult, baselines_of, label
 from evnlos.setups import Setup
 
 _LOWEST = 1e-3
+
+
+def folded(summary: str, content: str) -> str:
+    """Return HTML behind a line to click on; paper shows it in full.
+
+    Args:
+        summary: The line, in plain text.
+        content: HTML.
+    """
+    return f"<details><summary>{html.escape(summary)}</summary>{content}</details>"
+
+
+def lead_section(results: list[RunResult], limits: Identification | None) -> str:
+    """Return what stands below the title: best, median and worst object of the best run, and the verdict.
+
+    Args:
+        results: Evaluated runs; the best is that of the highest mean PSNR.
+        limits: What `identify` found on the setup; None where it is unknown.
+    """
+    best = max(results, key=lambda r: float(r.evaluation.scores.psnr_db.mean()))
+    found = best.evaluation
+    mean = {name: float(found.scores.psnr_db[found.names == name].mean()) for name in found.characters()}
+    order = sorted(mean, key=lambda name: -mean[name])
+    # Of two objects none is the median.
+    chosen = {order[len(order) // 2]: "median", order[-1]: "worst", order[0]: "best"}
+    cells = []
+    for name, rank in sorted(chosen.items(), key=lambda pair: -mean[pair[0]]):
+        there = np.flatnonzero(found.names == name)
+        k = there[len(there) // 2]
+        pair = data_uri(png(strip([grey(found.truth[k]), grey(found.images[k])], 2)))
+        words = html.escape(f"{rank}: {character_of(name)}, {mean[name]:.1f} dB")
+        cells.append(
+            f"<figure><img class=lead alt='truth and reconstruction, {words}' src='{pair}'>"
+            f"<figcaption>{words}</figcaption></figure>"
+        )
+    lines = "".join(
+        f"<p><b>{html.escape(line[:1].upper() + line[1:])}.</b></p>" for line in _said(best, limits)
+    )
+    return (
+        f"<div class=movies>{''.join(cells)}</div><p class=dim>Truth on the left, beside it the image of "
+        f"{html.escape(label(best))}, the run with the highest mean PSNR; objects ranked by theirs.</p>{lines}"
+    )
+
+
+def _said(run: RunResult, limits: Identification | None) -> list[str]:
+    """Return the verdict on all sequences of a run, in the words of the verdict on one."""
+    wall, checks = "" if limits is None else limits.wall, run.evaluation.confidence_checks
+    if not checks:
+        return Verdict(wall, "this run holds no confidence in its images", GUESSED[None]).lines
+    count = sum(one.measured for one in checks)
+    recording = f"of {count} of {len(checks)} sequences something was measured"
+    if 0 < count < len(checks):
+        return Verdict(wall, recording, f"of these, {GUESSED[True]}; of the others, {GUESSED[False]}").lines
+    return Verdict(wall, recording, GUESSED[count > 0]).lines
 
 
 def setup_section(name: str, setup: Setup | None) -> str:
@@ -222,15 +277,17 @@ def belief_section(results: list[RunResult]) -> str:
     wide = [np.mean([one.width for one in r.evaluation.confidence_checks]) for r in known]
     held_cells = "".join(f"<td colspan=2>{value:.0%}</td>" for value in held)
     wide_cells = "".join(f"<td colspan=2>{value:.2f}</td>" for value in wide)
-    return (
-        "<h2>How far to believe them</h2><p class=dim>Support: the share of what tells objects apart that both "
-        "halves of the sequence agree on, which the network says without knowing the truth. Skill: the share "
-        "of it "
-        "that is right; below 0 the average object would have been nearer. The intervals are to hold 90 % of "
-        "the target plane's pixels; a length of 1 is from black to white.</p>"
+    table = (
         f"<div class=wide><table><tr><th></th>{heads}</tr><tr><th></th>{names}</tr>{''.join(rows)}"
         f"<tr class=mean><td>pixels in their interval</td>{held_cells}</tr>"
         f"<tr><td>length of the intervals</td>{wide_cells}</tr></table></div>"
+    )
+    return (
+        "<h2>How far to believe them</h2><p class=dim>Support: the share of what distinguishes objects that "
+        "both halves of the sequence agree on, which the network says without knowing the truth. Skill: the "
+        "share of it that is right; below 0 the average object would have been nearer. The intervals are to hold 90 % of "
+        "the target plane's pixels; a length of 1 is from black to white.</p>"
+        + folded("Table of support and skill", table)
     )
 
 
@@ -258,7 +315,7 @@ def strips_section(results: list[RunResult]) -> str:
     more = f" {left} further objects are left out." if left > 0 else ""
     return (
         f"<h2>Position by position</h2><p class=dim>From left to right while the object passes.{more}</p>"
-        f"<div class=strips>{''.join(rows)}</div>"
+        + folded("Film strips", f"<div class=strips>{''.join(rows)}</div>")
     )
 
 

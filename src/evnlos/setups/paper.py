@@ -168,7 +168,7 @@ class PaperSetup(Setup):
 
     def wall_description(self) -> str:
         """Return the kernel in words."""
-        return f"the paper's kernel, {1e3 * self.tpsf_length_m:.3g} mm a unit of rho"
+        return f"the paper's kernel, {1e3 * self.tpsf_length_m:.3g} mm per unit of rho"
 
     def layout(self) -> Layout:
         """Return target and wall; the paper states no place of the camera."""
