@@ -11,7 +11,10 @@ UNITS = (
     "(?:second|pixel|position|step|image|(?:hidden )?object|capture|shot|frame|sample|event|sequence|setup|row"
     "|unit)"
 )
-RATES = "(?:events?|Hz|hertz|metres?|seconds?|[mun]?s|mm|chi2|noise|[kMG]B|dB|bytes|steps|frames|samples|dots|shard)"
+RATES = (
+    "(?:events?|Hz|hertz|metres?|seconds?|[mun]?s|mm|chi2|noise|[kMG]B|dB|bytes|steps|frames|samples|dots"
+    "|shard)"
+)
 BANNED = {
     "rightly": "correctly",
     "told apart": "distinguished",
