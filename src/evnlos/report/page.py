@@ -219,8 +219,8 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
     seen = f"{len(first.images)} images of {len(first.characters())} objects ({html.escape(objects)})"
     return (
         f"<p class=dim>evnlos {__version__} · {seen}, split “{html.escape(split)}”</p>{lines}"
-        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm per pixel; {psnr} is the mean over "
-        "the images of each image's PSNR with peak 1. The first columns are what one scores without "
+        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm per pixel; {psnr} is the mean "
+        "over the images of each image's PSNR with peak 1. The first columns are what one scores without "
         "looking: an all-black image, and the mean of the training images, then what pure memory scores. A "
         f"method that does not exceed them has learned nothing.{no_lpips}</p>"
         f"<p><b>{words.link('e2e')}</b>: trained on the captures alone. <b>{words.link('epnp')}</b>: "

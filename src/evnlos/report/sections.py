@@ -279,8 +279,8 @@ def belief_section(results: list[RunResult]) -> str:
         f"<tr><td>length of the intervals</td>{wide_cells}</tr></table></div>"
     )
     return (
-        "<h2>How far to believe them</h2><p class=dim>Support: the share of what distinguishes objects that both "
-        "halves of the sequence agree on, which the network says without knowing the truth. Skill: the share "
+        "<h2>How far to believe them</h2><p class=dim>Support: the share of what distinguishes objects that "
+        "both halves of the sequence agree on, which the network says without knowing the truth. Skill: the share "
         "of it "
         "that is right; below 0 the average object would have been nearer. The intervals are to hold 90 % of "
         "the target plane's pixels; a length of 1 is from black to white.</p>"
