@@ -50,6 +50,7 @@ clean:
 
 # PyTorch first: its CPU build where the package index has one, else whatever build the index gives.
 $(READY): pyproject.toml packages/evnlos-weights/pyproject.toml constraints.txt
+	@echo "setting up .venv, some minutes"
 	test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0+cpu" \
 	  || $(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"

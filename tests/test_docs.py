@@ -73,6 +73,11 @@ def test_the_index_lists_every_page() -> None:
     assert examples == {str(path.relative_to(ROOT)) for path in there}
 
 
+def test_the_home_of_the_site_shows_the_setup_and_the_film() -> None:
+    shown = re.findall(r"!\[[^]]+\]\(figures/([\w.]+)\)", (DOCS / "README.md").read_text())
+    assert {"setup_paper.svg", "learned_film.webp"} <= set(shown)
+
+
 def test_headings_that_links_name_exist() -> None:
     for page in PAGES:
         for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", page.read_text()):

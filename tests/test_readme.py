@@ -130,6 +130,13 @@ def test_the_commands_behind_the_figures_are_whole() -> None:
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
+def test_make_says_that_it_sets_up_before_minutes_of_silence() -> None:
+    call = ["make", "-n", "-B", ".venv/.ready"]
+    shown = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert "setting up .venv, some minutes" in shown.partition("pip install")[0]
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
 def test_captures_and_results_of_the_demo_may_have_spaces_in_their_names() -> None:
     """`make demo CAPTURES="my shots/a"` handed over two words, `my` and `shots/a`."""
     call = ["make", "-n", "-o", ".venv/.ready", "demo", "CAPTURES=my shots/*", "DEMO=my demo"]

@@ -73,31 +73,50 @@ def test_a_release_is_clean_tagged_and_described(tool, checkout) -> None:
     assert "not committed" in faults and "CITATION.cff" in faults and "CHANGELOG" not in faults
 
 
-def test_an_sdist_carries_its_version_and_no_weights(tool, tmp_path) -> None:
+def test_an_sdist_carries_its_version_and_no_weights(tool, tmp_path, monkeypatch) -> None:
     sdist, wheel = tool.build_core(tmp_path, "9.8.7")  # the wheel is built from the sdist, where no git is
     assert (sdist.name, wheel.name) == ("evnlos-9.8.7.tar.gz", "evnlos-9.8.7-py3-none-any.whl")
     tool.check_core(sdist, wheel, "9.8.7")
     with pytest.raises(SystemExit, match=r"Version: 9\.8\.7 where 9\.8\.8"):
         tool.check_core(sdist, wheel, "9.8.8")
+    with monkeypatch.context() as limits, pytest.raises(SystemExit, match=r"MB; at most 0\.001$"):
+        limits.setattr(tool, "MOST_BYTES", 1000)
+        tool.check_core(sdist, wheel, "9.8.7")
     tool.write_sums(tmp_path)
     listed = dict(reversed(line.split()) for line in (tmp_path / "SHA256SUMS").read_text().splitlines())
     assert listed.keys() == {sdist.name, wheel.name}
     assert listed[wheel.name] == hashlib.sha256(wheel.read_bytes()).hexdigest()
 
 
-def test_weights_are_those_of_their_sums(tool, tmp_path) -> None:
+METADATA = "evnlos_weights-0.1.0.dist-info/METADATA"
+
+
+def test_weights_are_those_of_their_sums(tool, tmp_path, monkeypatch) -> None:
     wheel, content = tmp_path / "w.whl", {"near-frame.safetensors": b"weights", "near.yaml": b"kind: paper"}
     content |= {"near/setup.yaml": b"kind: fitted", "near/wall.safetensors": b"wall"}
+    told = "Metadata-Version: 2.4\nName: evnlos-weights\nVersion: 0.1.0\nLicense-Expression: MIT\n"
     for total, is_right in ((hashlib.sha256(b"weights").hexdigest(), True), ("0" * 64, False)):
         with zipfile.ZipFile(wheel, "w") as archive:
             for name, data in content.items():
                 archive.writestr(f"evnlos_weights/{name}", data)
             archive.writestr("evnlos_weights/SHA256SUMS", f"{total}  near-frame.safetensors\n")
+            archive.writestr(METADATA, told)
         if is_right:
             tool.check_weights(wheel)
+            with monkeypatch.context() as limits, pytest.raises(SystemExit, match="MB; at most 0"):
+                limits.setattr(tool, "MOST_BYTES_OF_WEIGHTS", 100)
+                tool.check_weights(wheel)
         else:
             with pytest.raises(SystemExit, match="not the file"):
                 tool.check_weights(wheel)
+    for right, wrong in (("0.1.0", "0.0.9"), ("evnlos-weights", "weights"), ("MIT", "GPL")):
+        with zipfile.ZipFile(wheel, "w") as archive:
+            for name, data in content.items():
+                archive.writestr(f"evnlos_weights/{name}", data)
+            archive.writestr("evnlos_weights/SHA256SUMS", "")
+            archive.writestr(METADATA, told.replace(right, wrong))
+        with pytest.raises(SystemExit, match=f"{wrong} where {right} is right"):
+            tool.check_weights(wheel)
 
 
 def test_files_to_upgrade_from_need_a_version() -> None:

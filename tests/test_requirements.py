@@ -66,6 +66,18 @@ def test_what_the_package_imports_is_declared() -> None:
     assert undeclared == {}
 
 
+NOT_IN_ALL = {"all", "docs", "dev"}
+
+
+def test_the_page_on_installing_gives_the_size_of_every_extra() -> None:
+    page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    sizes = dict(re.findall(r"^\| `(\w+)` \| (\d+) \|", page, flags=re.MULTILINE))
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert sizes.keys() == declared.keys()
+    parts = [int(size) for extra, size in sizes.items() if extra not in NOT_IN_ALL]
+    assert max(parts) < int(sizes["all"]) <= sum(parts)  # what two of them share counts once
+
+
 @pytest.mark.parametrize("module", REQUIRED)
 def test_the_doctor_names_each_missing_package(module: str, monkeypatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, module, None)

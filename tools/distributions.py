@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import email
+import email.message
 import hashlib
 import importlib.metadata
 import os
@@ -27,6 +28,7 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -37,6 +39,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parent.parent
 WEIGHTS = ROOT / "packages" / "evnlos-weights"
 MOST_BYTES = 10_000_000
+MOST_BYTES_OF_WEIGHTS = 100_000_000  # about the most that package indexes take in a file
 IN_WHEEL = (
     "evnlos/py.typed",
     "evnlos/__init__.pyi",
@@ -130,19 +133,33 @@ def check_core(sdist: Path, wheel: Path, version: str) -> None:
         names = archive.getnames()
         held = archive.extractfile(f"{sdist.name.removesuffix('.tar.gz')}/PKG-INFO")
         stated = [email.message_from_bytes(held.read() if held else b"")]
-    with zipfile.ZipFile(wheel) as archive:
-        metadata = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
-        stated.append(email.message_from_bytes(archive.read(metadata)))
-    for key, wanted in {"Name": "evnlos", "Version": version, "License-Expression": "MIT"}.items():
-        if found := [one[key] for one in stated if one[key] != wanted]:
-            raise SystemExit(f"the metadata says {key}: {found[0]} where {wanted} is right")
+    check_metadata([*stated, metadata_of(wheel)], "evnlos", version)
     weights = [name for name in names if name.endswith(".safetensors") and not name.endswith(READER)]
     if weights:
         raise SystemExit(f"{sdist.name} holds weights: {', '.join(weights)}")
     modules = [one for one in (ROOT / "src" / "evnlos").rglob("*.py*") if one.suffix in (".py", ".pyi")]
     check_names(wheel, (*IN_WHEEL, *(one.relative_to(ROOT / "src").as_posix() for one in modules)))
-    if wheel.stat().st_size >= MOST_BYTES:
-        raise SystemExit(f"{wheel.name} has {wheel.stat().st_size / 1e6:.1f} MB; at most {MOST_BYTES / 1e6:g}")
+    check_size(wheel, MOST_BYTES)
+
+
+def metadata_of(wheel: Path) -> email.message.Message:
+    """Return what a wheel says of itself."""
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return email.message_from_bytes(archive.read(metadata))
+
+
+def check_metadata(stated: list[email.message.Message], name: str, version: str) -> None:
+    """Raise where name, version or licence are wrong."""
+    for key, wanted in {"Name": name, "Version": version, "License-Expression": "MIT"}.items():
+        if found := [one[key] for one in stated if one[key] != wanted]:
+            raise SystemExit(f"the metadata says {key}: {found[0]} where {wanted} is right")
+
+
+def check_size(wheel: Path, most: int) -> None:
+    """Raise where a wheel is too large."""
+    if wheel.stat().st_size >= most:
+        raise SystemExit(f"{wheel.name} has {wheel.stat().st_size / 1e6:.1f} MB; at most {most / 1e6:g}")
 
 
 def check_names(wheel: Path, wanted: tuple[str, ...]) -> None:
@@ -154,8 +171,11 @@ def check_names(wheel: Path, wanted: tuple[str, ...]) -> None:
 
 
 def check_weights(wheel: Path) -> None:
-    """Raise where a wheel of weights lacks files, or a file is not that of the sums in it."""
+    """Raise where a wheel of weights is too large, lacks files, or has wrong metadata or sums."""
     check_names(wheel, IN_WEIGHTS)
+    project = tomllib.loads((WEIGHTS / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    check_metadata([metadata_of(wheel)], project["name"], project["version"])
+    check_size(wheel, MOST_BYTES_OF_WEIGHTS)
     with zipfile.ZipFile(wheel) as archive:
         for line in archive.read("evnlos_weights/SHA256SUMS").decode().splitlines():
             total, name = line.split()
