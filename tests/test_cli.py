@@ -248,8 +248,8 @@ def test_report_is_one_page_without_requests(runs, recorded, tmp_path, capsys) -
     page = (tmp_path / "report.html").read_text()
     assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))
-    # One position, a strip of truth and runs, an animation, the worst images of each run.
-    assert page.count("<img") == (3 + len(runs)) + (1 + len(runs)) + 1 + 6 * len(runs)
+    # What leads, one position, a strip of truth and runs, an animation, the worst images of each run.
+    assert page.count("<img") == 1 + (3 + len(runs)) + (1 + len(runs)) + 1 + 6 * len(runs)
     rows = (tmp_path / "report.csv").read_text().splitlines()
     assert rows[0].split(",")[3:6] == ["all-black", "mean image", "mean target at its place"]
     assert {"simulation only frame", "E2E fusion", "EPNP frame"} <= set(rows[0].split(","))

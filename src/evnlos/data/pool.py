@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import os
 import signal
@@ -221,6 +222,7 @@ def _end(*_: object) -> None:
     """End the task at hand, and this worker with it."""
     sys.unraisablehook = _end_anew
     sys.excepthook = _told_nobody  # which C extensions call where they let no exception out
+    sys.stderr = io.StringIO()  # what breaks as the signal strikes half-made things is no news
     sys.exit(128 + signal.SIGTERM)
 
 
