@@ -150,9 +150,10 @@ class SlopeTable(NamedTuple):
 
 
 @njit(cache=True, fastmath=STRICT, inline="always")
-def _pair(point: Array, frame: Array, eye: Array, cx: float, cy: float, cz: float, masking: float):
+def _pair(seen: Seen, p: int, cells: Cells, q: int, masking: float):
     """Return slopes (x, y) of the half vector, the facets' factor but for their density, the matte one."""
-    dx, dy, dz = cx - point[0], cy - point[1], cz - point[2]
+    point, frame, eye, cell = seen.points[p], seen.frames[p], seen.eyes[p], cells.points[q]
+    dx, dy, dz = cell[0] - point[0], cell[1] - point[1], cell[2] - point[2]
     inverse2 = 1.0 / (dx * dx + dy * dy + dz * dz)
     inverse = math.sqrt(inverse2)
     ix = (dx * frame[0] + dy * frame[1] + dz * frame[2]) * inverse
@@ -164,10 +165,10 @@ def _pair(point: Array, frame: Array, eye: Array, cx: float, cy: float, cz: floa
     hz = iz + eye[2]
     sx, sy = (ix + eye[0]) / hz, (iy + eye[1]) / hz
     bent = 1.0 + sx * sx + sy * sy
-    seen = 2.0 / (1.0 + math.sqrt(1.0 + masking * masking * (1.0 - eye[2] * eye[2]) / (eye[2] * eye[2])))
+    viewed = 2.0 / (1.0 + math.sqrt(1.0 + masking * masking * (1.0 - eye[2] * eye[2]) / (eye[2] * eye[2])))
     lit = 2.0 / (1.0 + math.sqrt(1.0 + masking * masking * (1.0 - iz * iz) / (iz * iz)))
     # f cos_i = D G / (4 cos_o), and D = P(slopes) / cos^4 of the half vector.
-    return sx, sy, seen * lit * bent * bent / (4.0 * eye[2]) * fall, iz * fall / math.pi
+    return sx, sy, viewed * lit * bent * bent / (4.0 * eye[2]) * fall, iz * fall / math.pi
 
 
 @njit(cache=True, fastmath=STRICT, inline="always")
@@ -217,10 +218,7 @@ def fill_facets(out: NDArray, seen: Seen, cells: Cells, table: SlopeTable, maski
     nodes = table.log_density.shape[0]
     for p in prange(out.shape[0]):
         for q in range(cells.points.shape[0]):
-            sx, sy, glossy, dull = _pair(
-                seen.points[p], seen.frames[p], seen.eyes[p], cells.points[q, 0], cells.points[q, 1],
-                cells.points[q, 2], masking,
-            )  # fmt: skip
+            sx, sy, glossy, dull = _pair(seen, p, cells, q, masking)
             a, b = _place(sx, sy, table.scale, table.step, nodes)
             out[p, q] = cells.area * (glossy * math.exp(_value(table.log_density, a, b)) + table.matte * dull)
 
@@ -245,10 +243,7 @@ def carry_facets(
     for p in prange(out.shape[0]):
         row = np.empty(cells.points.shape[0])
         for q in range(cells.points.shape[0]):
-            sx, sy, glossy, dull = _pair(
-                seen.points[p], seen.frames[p], seen.eyes[p], cells.points[q, 0], cells.points[q, 1],
-                cells.points[q, 2], masking,
-            )  # fmt: skip
+            sx, sy, glossy, dull = _pair(seen, p, cells, q, masking)
             a, b = _place(sx, sy, table.scale, table.step, nodes)
             row[q] = cells.area * (glossy * math.exp(_value(table.log_density, a, b)) + table.matte * dull)
         for n in range(out.shape[1]):
@@ -292,10 +287,7 @@ def facet_slopes(
         weight = np.empty((cell_count, 6))
         acc = np.empty(out.shape[2])
         for q in range(cell_count):
-            sx, sy, glossy, dull = _pair(
-                seen.points[p], seen.frames[p], seen.eyes[p], cells.points[q, 0], cells.points[q, 1],
-                cells.points[q, 2], masking,
-            )  # fmt: skip
+            sx, sy, glossy, dull = _pair(seen, p, cells, q, masking)
             a, b = _place(sx, sy, table.scale, table.step, nodes)
             row[q] = cells.area * glossy * math.exp(_value(table.log_density, a, b))
             dull_row[q] = cells.area * dull
@@ -340,10 +332,7 @@ def carry_lobes(
         rows = np.empty((cells.points.shape[0], lobes + 1))
         acc = np.empty(lobes + 1)
         for q in range(cells.points.shape[0]):
-            sx, sy, glossy, dull = _pair(
-                seen.points[p], seen.frames[p], seen.eyes[p], cells.points[q, 0], cells.points[q, 1],
-                cells.points[q, 2], masking,
-            )  # fmt: skip
+            sx, sy, glossy, dull = _pair(seen, p, cells, q, masking)
             for k in range(lobes):
                 ax, ay = alphas[k, 0], alphas[k, 1]
                 wide = 1.0 + (sx / ax) ** 2 + (sy / ay) ** 2
