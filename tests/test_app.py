@@ -24,6 +24,7 @@ import pytest
 
 import chromium
 from evnlos import Events, machine, untrusted
+from evnlos.analysis.identify import GUESSED
 from evnlos.app.controls import (
     CHARACTERS,
     INK_SIDE,
@@ -124,6 +125,7 @@ def test_networks_of_the_package_see_more_than_least_squares(app_sequence) -> No
     for name in ("network, frames", "network, both"):
         assert found[name].psnr_db.mean() > single + 2, name
         assert "all frames" in found[name].note and "agree on" in found[name].note
+        assert any(guessed in found[name].note for guessed in GUESSED.values())
 
 
 def test_images_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames() -> None:

@@ -250,7 +250,7 @@ def test_picard_and_image():
 @pytest.mark.parametrize(
     ("widths", "words"),
     [
-        ((0.005, 0.006), "strokes of 8.0 mm are measured"),
+        ((0.005, 0.006), "strokes of 8.0 mm are measured; finer detail would come from the training data"),
         ((0.012, 0.019), "rough shape"),
         ((0.012, 0.021), "not from the measurement"),
         ((None, 0.004), "lying bars down to 4.0 mm, upright ones not at all"),

@@ -62,7 +62,9 @@ def verdict(
         bars = f"bars down to {1e3 * max(resolved):.1f} mm"
     finest = None if upright is None or lying is None else max(upright, lying)
     if finest is not None and finest <= stroke_m:
-        meaning = f"strokes of {1e3 * stroke_m:.1f} mm are measured"
+        meaning = (
+            f"strokes of {1e3 * stroke_m:.1f} mm are measured; finer detail would come from the training data"
+        )
     elif finest is not None and finest <= target_size_m / _SHAPE:
         fine = f"strokes of {1e3 * stroke_m:.1f} mm are too fine for this wall"
         meaning = f"the rough shape is measured, {fine}: their detail would come from the training data"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from evnlos.analysis import reconstruct
 from evnlos.analysis.confidence import confidence_of, consistent, why_no_confidence
+from evnlos.analysis.identify import verdict_on
 from evnlos.app.controls import COARSE, Recorded
 from evnlos.data import STANDARD_MODALITIES, Sampling, as_modality, object_light
 from evnlos.errors import DataError
@@ -191,10 +192,11 @@ def from_weights(
     images = pictures[:, sampling.scored].numpy()
     noun = weights.modality.noun
     saw = f"all {noun}" if weights.network.sees_sequence else f"{noun} of one time step"
-    can_judge = why_no_confidence(weights, samples) is None
-    operator = wall(sampling) if wall is not None and can_judge else None
+    unjudged = why_no_confidence(weights, samples)
+    operator = wall(sampling) if wall is not None and unjudged is None else None
     confidence = confidence_of(weights, samples, pictures, operator)
-    note = f"network: {saw}" + (f"; {confidence.verdict}" if confidence else "")
+    verdict = verdict_on(None, confidence, unjudged)  # what the wall allows stands in a box of its own
+    note = "; ".join([f"network: {saw}", *verdict.lines])
     return _scored(name, note, images, recorded, sampling)
 
 
