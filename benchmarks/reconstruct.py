@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evnlos.analysis import StreamingReconstructor, reconstruct
+from evnlos.analysis import reconstruct
 from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.data.sampling import make_samples
 from evnlos.models import UNetConfig, Weights, load_weights

@@ -361,9 +361,9 @@ def weights(draw: random.Random, at: Path, material: Material) -> Callable[[], o
         path.write_bytes(save(tensors, metadata={"evnlos": json.dumps(about)}))
 
     def described() -> object:
-        from evnlos.cli.learning import describe, to_text
+        from evnlos.report.provenance import about_weights, weights_text
 
-        return to_text("w", describe(load_weights(path)))
+        return weights_text("w", about_weights(load_weights(path)))
 
     return described
 

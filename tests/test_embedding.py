@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from evnlos import EvnlosError, train
-from evnlos.analysis import StreamingReconstructor
 from evnlos.data import NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError
+from evnlos.live import StreamingReconstructor
 from evnlos.models import UNetConfig, Weights, fit_linear, load_weights, save_weights
 from evnlos.models.embedding import InputNormalization, LinearEmbedding, LinearEmbeddings
 from evnlos.training import Training

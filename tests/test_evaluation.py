@@ -10,9 +10,10 @@ import torch
 import torch.nn.functional as F
 
 from evnlos import EvnlosError
-from evnlos.analysis import Evaluation, StreamingReconstructor, load_lpips, reconstruct, score
+from evnlos.analysis import Evaluation, load_lpips, reconstruct, score
 from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.errors import DataError
+from evnlos.live import StreamingReconstructor
 from evnlos.models import UNetConfig, Weights
 from evnlos.report import RunResult
 from evnlos.report.pictures import curves_svg

@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -285,6 +286,27 @@ def test_the_fast_estimate_is_that_of_the_slow_one(pixel: PixelSettings, seed: i
     assert 0.8 < expected < 1.25
 
 
+def test_what_events_say_so_far_knows_nothing_of_later_ones() -> None:
+    """It says ever more, from an instant before the first event on, and at the end what all of them say."""
+    law = PIXEL.crossing_law(40.0)
+    assert law is not None
+    solver, events, end = EventSolver(light(), law), simulated(0), float(light().times_s[-1])
+    (whole,) = solver.so_far(events, np.array([end]))
+    np.testing.assert_array_equal(whole.score, solver(events).score)
+    first_s = 1e-6 * float(events.t_us[0])
+    instants = np.array([0.5 * first_s, 0.2 * end, 0.5 * end, end])
+    found = list(solver.so_far(events, instants))
+    cut = events.between(0, round(5e5 * end) + 1)
+    for early, again in zip(found, solver.so_far(cut, instants[:-1]), strict=False):
+        np.testing.assert_array_equal(early.z, again.z)
+    told = [np.linalg.slogdet(np.eye(COUNT) + one.information)[1] for one in found]
+    assert all(before < after for before, after in pairwise(told)) and told[0] < 0.05 * told[-1]
+    away = prior().image(found[-1].z) - prior().image(whole.z)  # by another way
+    assert np.sqrt((away**2).mean()) < 0.1 * np.sqrt(
+        prior().variance(np.linalg.inv(found[-1].information)).mean()
+    )
+
+
 @pytest.mark.parametrize(("stride", "rank"), [(1, 200), (3, 200), (4, 2)])
 def test_the_light_of_some_rows_and_columns_is_that_of_all(stride: int, rank: int) -> None:
     z, whole = np.random.default_rng(stride).normal(size=COUNT), light()
@@ -327,6 +349,19 @@ def test_the_clock_of_a_recording_does_not_matter(tmp_path: Path) -> None:
     first = event_images(events, edges, BENCH.motion, setup, canvas)
     assert first.shape == (8, 2, 64, 96) and first.any()
     np.testing.assert_array_equal(event_images(later, edges + late_us, moved, setup, canvas), first)
+
+
+def test_the_surface_so_far_is_that_of_the_events_so_far(tmp_path: Path) -> None:
+    save_yaml(to_dict(Simulation(setup=SETUP)), tmp_path / "setup.yaml")
+    events, edges = simulated(0), np.arange(0, 8_000_001, 500_000)
+    given = edges, BENCH.motion, str(tmp_path / "setup.yaml"), Sampling().canvas
+    found = event_images(events, *given, so_far=True)
+    early = event_images(events.between(0, int(edges[5]) + 1), *given, so_far=True)
+    np.testing.assert_array_equal(found[:5], early[:5])
+    assert not np.allclose(found[5], early[5])
+    whole = event_images(events, *given)
+    scale = np.square(whole[-1]).mean()
+    assert np.square(found[-1] - whole[-1]).mean() < 1e-3 * scale < np.square(found[1] - whole[1]).mean()
 
 
 def test_the_surface_is_refused_without_setup_or_motion() -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from evnlos import EvnlosError, evaluate, train
-from evnlos.analysis import StreamingReconstructor, curve_over_positions
+from evnlos.analysis import curve_over_positions, curve_so_far
 from evnlos.analysis.model import choices
 from evnlos.analysis.scores import aligned_mean
 from evnlos.cli import main
@@ -27,12 +27,15 @@ from evnlos.inverse import (
     event_prior,
     ridge_by_groups,
 )
+from evnlos.live import StreamingReconstructor
 from evnlos.machine import Step
+from evnlos.metrics import psnr
 from evnlos.models import (
     FrameOperator,
     SequenceConfig,
     SequenceReconstructor,
     UNetConfig,
+    Weights,
     load_weights,
     on_target_plane,
 )
@@ -161,6 +164,51 @@ def test_the_curve_over_positions_ends_at_the_whole_sequence(trained, tiny_datas
     assert points[0].psnr_db != pytest.approx(every, abs=1e-2)
     with pytest.raises(DataError, match=f"{whole + 1} positions"):
         curve_over_positions(weights, tiny_dataset, "train", (1, whole + 1))
+
+
+def test_the_curve_so_far_ends_at_the_whole_sequence(trained, tiny_dataset, capsys) -> None:
+    """Each image is made of the time steps up to its own; later ones may hold anything."""
+    weights = load_weights(trained[0])
+    points = curve_so_far(weights, tiny_dataset, "train")
+    samples = NlosDataset(tiny_dataset, "train", "frame")
+    mine = np.flatnonzero(samples.names == samples.names[0])
+    assert [point.positions for point in points] == list(range(1, len(mine) + 1))
+    rows, network = tiny_dataset.sampling.scored, weights.network.eval()
+    inputs, places = samples.inputs[mine].float(), torch.from_numpy(samples.position_m[mine]).float()
+    truth = samples.truth[mine].float()
+    for step in (0, 1, len(mine) - 1):
+        part = slice(0, step + 1)
+        with torch.no_grad():
+            image = network.draw(inputs[part], places[part], places[step : step + 1])
+        own = psnr(image[:, rows].contiguous(), truth[step : step + 1, rows].contiguous())
+        assert points[step].objects[str(samples.names[0])] == pytest.approx(float(own), abs=1e-3)
+    arguments = ["--weights", str(trained[0]), "--data", str(tiny_dataset.folder), "--split", "train"]
+    main(["evaluate", *arguments, "--so-far", "--json"])
+    shown = json.loads(capsys.readouterr().out)["so_far"]
+    assert [point["psnr_db"] for point in shown] == [point.psnr_db for point in points]
+    main(["evaluate", *arguments, "--so-far", "--positions", "2"])
+    table = capsys.readouterr().out
+    assert f"| 2 | {points[1].psnr_db:.2f} |" in table and "| 1 |" not in table
+    mean = np.mean([point.psnr_db for point in points])
+    assert f"| mean of all | {mean:.2f} |" in table
+
+
+def test_of_surfaces_so_far_the_last_one_counts() -> None:
+    sampling = Sampling(surface="so-far")
+    see = replace(NET, rank=8).build("event", sampling).eval()
+    other = replace(NET, rank=8).build("event", replace(sampling, surface="likelihood")).eval()
+    other.load_state_dict(see.state_dict())
+    maps, places = torch.rand(5, 2, 64, 96), torch.zeros(5, 2)
+    kept = torch.tensor([[1.0, 1, 1, 1, 1], [1, 0, 1, 0, 0], [0, 1, 0, 0, 0]])
+    alone = torch.cat([other.pooled(maps[k : k + 1], places[:1])[None] for k in (4, 2, 1)])
+    torch.testing.assert_close(see.pooled_subsets(maps, places, kept), alone)
+    assert not torch.allclose(other.pooled_subsets(maps, places, kept)[0], alone[0])
+
+
+def test_surfaces_that_know_later_events_are_refused(tiny_dataset) -> None:
+    weights = Weights(NET.build("event", tiny_dataset.sampling))
+    with pytest.raises(DataError, match=r"--sampling\.surface so-far"):
+        curve_so_far(weights, tiny_dataset, "train")
 
 
 def test_evaluate_prints_the_curve(trained, tiny_dataset, capsys) -> None:

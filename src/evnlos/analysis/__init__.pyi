@@ -20,8 +20,8 @@ from .linearized import AnalysisSettings as AnalysisSettings
 from .model import Model as Model
 from .model import PositionsPoint as PositionsPoint
 from .model import Reconstruction as Reconstruction
-from .model import StreamingReconstructor as StreamingReconstructor
 from .model import curve_over_positions as curve_over_positions
+from .model import curve_so_far as curve_so_far
 from .model import load_model as load_model
 from .scores import Scores as Scores
 from .scores import available_lpips as available_lpips

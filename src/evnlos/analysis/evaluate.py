@@ -287,6 +287,7 @@ def evaluate(
     check_sampling(weights, dataset.sampling)
     samples = NlosDataset(dataset, split, weights.modality)
     progress(Step("evaluate", 0, 3, "stages", within=f"reconstruct {len(samples)} images"))
+    weights.network.sampling = weights.sampling.corrected_as(dataset.sampling)
     images = weights.network.infer(samples.inputs, samples.position_m, samples.names)
     progress(Step("evaluate", 1, 3, "stages", within="scores and baselines"))
     found = assess(images, samples, dataset, split, weights.mean_image, perceptual)

@@ -1,13 +1,11 @@
-"""Trained models at work: a recording at once, step by step, and with growing numbers of time steps.
+"""Trained models at work: on a recording at once, and with growing numbers of time steps.
 
-- One time step after the other, as fast as a CPU goes: the network as a graph with its constants folded in.
 - A pretrained or trained model: a recording in; images, how far to believe them, and warnings out.
-- How the image of a sequence network grows with the number of positions that it sees.
+- How the image of a sequence network grows with the positions that it sees, and as the recording goes on.
 """
 
 from __future__ import annotations
 
-import warnings
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,67 +28,14 @@ from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, ca
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, counted, note, silent
 from evnlos.metrics import psnr
-from evnlos.models import ConfidenceReport, Weights, load_weights, published_setup, published_single
+from evnlos.models import (
+    ConfidenceReport,
+    Reconstructor,
+    Weights,
+    load_weights,
+    published_setup,
+)
 from evnlos.setups import Setup, load_setup
-
-
-class StreamingReconstructor:
-    """A network of single time steps: the same images as `reconstruct`, without Python between its layers.
-
-    The graph is traced at the first use (about a second), for the sampling that the weights were trained on.
-
-    Args:
-        weights: The network.
-
-    Raises:
-        DataError: The network sees whole sequences.
-
-    Example:
-        >>> from evnlos.data import Sampling
-        >>> from evnlos.models import UNetConfig
-        >>> sampling = Sampling(height=16, width=24, scored_rows=12)
-        >>> network = UNetConfig(width=4, depth=1, rank=0).build("frame", sampling)
-        >>> see = StreamingReconstructor(Weights(network))
-        >>> see(np.zeros((16, 24)), np.zeros((2, 16, 24))).shape
-        torch.Size([16, 24])
-    """
-
-    def __init__(self, weights: Weights) -> None:
-        self.modality, self.sampling = weights.modality, weights.sampling
-        if weights.network.sees_sequence:
-            names = " or ".join(published_single())
-            raise DataError(
-                f"these weights see whole sequences; give weights of single time steps: {names}, which come "
-                "with the package, or your own, trained with --network.kind unet"
-            )
-        shape = (1, self.modality.channels, self.sampling.height, self.sampling.width)
-        network = weights.network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        example = torch.zeros(shape).contiguous(memory_format=torch.channels_last)
-        with torch.inference_mode(), warnings.catch_warnings():
-            # The sizes are fixed here, which is what the tracer warns of.
-            warnings.simplefilter("ignore")
-            self._graph = torch.jit.freeze(torch.jit.trace(network, example))
-
-    @torch.inference_mode()
-    def __call__(self, frame: NDArray, surface: NDArray) -> Tensor:
-        """Return the image, float32 [H, W], 0..1, of one time step.
-
-        Args:
-            frame: What the frame camera saw, [H, W], as in `Samples`.
-            surface: Time surface, [2, H, W]; [4, H, W] of `sae-trace`.
-
-        Raises:
-            DataError: The maps are not of the size that the network was trained on.
-        """
-        size = (self.sampling.height, self.sampling.width)
-        if np.shape(frame) != size or np.shape(surface) != (self.sampling.surface_maps, *size):
-            raise DataError(
-                f"frame {np.shape(frame)} and surface {np.shape(surface)} do not fit weights for {size}; bring "
-                "them to that size by `make_samples`"
-            )
-        seen = self.modality.inputs(np.asarray(frame)[None], np.asarray(surface)[None])
-        return self._graph(seen.contiguous(memory_format=torch.channels_last))[0, 0]
-
 
 _SAME_LIGHT = (0.75, 1.33)
 """Range of a recording's brightness, in that of its calibrated setup, in which the setup's gain is its own."""
@@ -304,7 +249,7 @@ class PositionsPoint:
     Args:
         positions: Positions that it saw.
         subsets: Choices of so many positions that the scores are a mean over, at most.
-        psnr_db: Mean PSNR over the images of all positions of the split, the scored canvas, dB.
+        psnr_db: Mean PSNR over the images that are scored, the scored canvas, dB.
         objects: The same of each object, dB.
     """
 
@@ -339,20 +284,9 @@ def curve_over_positions(
         DataError: The network sees single time steps, the motion of an object is unknown, a count is more than
             a sequence has, or the samples were made in another way than those of the training.
     """
-    network = weights.network
-    if not network.sees_sequence:
-        raise DataError(
-            "these weights see single time steps; give those of a network of whole sequences (train with "
-            "--network.kind sequence)"
-        )
-    check_sampling(weights, dataset.sampling)
-    samples = NlosDataset(dataset, split, weights.modality)
-    if np.isnan(samples.position_m).any():
-        raise DataError("the motion of an object is unknown; give it in capture.yaml (`evnlos track` finds it)")
-    sequences = {name: np.flatnonzero(samples.names == name) for name in dict.fromkeys(samples.names.tolist())}
+    network, samples, sequences = _sequences(weights, dataset, split)
     # All of them before the first reconstruction, so that a count that is too large costs no time.
     chosen = {count: {name: choices(len(mine), count) for name, mine in sequences.items()} for count in counts}
-    network.eval()
     rows = dataset.sampling.scored
     found = []
     for count, parts_of in counted(chosen.items(), progress, "positions", len(chosen), "numbers of them"):
@@ -369,6 +303,66 @@ def curve_over_positions(
         subsets = max(len(parts) for parts in parts_of.values())
         found.append(PositionsPoint(count, subsets, float(np.mean(list(means.values()))), means))
     return found
+
+
+@torch.inference_mode()
+def curve_so_far(
+    weights: Weights, dataset: Dataset, split: str = "test", progress: Progress = silent
+) -> list[PositionsPoint]:
+    """Score the image at each time step that is made of what was seen up to it, and of nothing later.
+
+    Args:
+        weights: Those of a network of whole sequences; where it sees events, they were solved for the target.
+        dataset: Where the samples are; with events of the surface `so-far`, whatever weights learned from.
+        split: "train", "validation", "test" or "all".
+        progress: Called after each of the objects.
+
+    Returns:
+        A point for each number of positions so far, up to those of the shortest sequence: what is scored is the
+        image at the last of them.
+
+    Raises:
+        DataError: As of `curve_over_positions`, or the surfaces of the events know later ones.
+    """
+    network, samples, sequences = _sequences(weights, dataset, split)
+    if network.modality.needs_events and dataset.sampling.surface != "so-far":
+        raise DataError(
+            f"surfaces of {dataset.sampling.surface!r} are not of the events so far alone; import the captures "
+            "with --sampling.surface so-far"
+        )
+    network.sampling = weights.sampling.corrected_as(dataset.sampling)
+    rows, steps = dataset.sampling.scored, min(map(len, sequences.values()))
+    decibel = np.empty((steps, len(sequences)))
+    mine_of = counted(sequences.values(), progress, "so far", len(sequences), "sequences")
+    for number, mine in enumerate(mine_of):
+        places = torch.from_numpy(samples.position_m[mine].astype(np.float32))
+        inputs, truth = (part[torch.from_numpy(mine)].float() for part in (samples.inputs, samples.truth))
+        for step in range(steps):
+            seen, now = slice(0, step + 1), slice(step, step + 1)
+            drawn = network.draw(inputs[seen], places[seen], places[now])
+            decibel[step, number] = psnr(drawn[:, rows].contiguous(), truth[now, rows].contiguous())[0]
+    return [
+        PositionsPoint(step + 1, 1, float(row.mean()), dict(zip(sequences, row.tolist(), strict=True)))
+        for step, row in enumerate(decibel)
+    ]
+
+
+def _sequences(
+    weights: Weights, dataset: Dataset, split: str
+) -> tuple[Reconstructor, NlosDataset, dict[str, NDArray[np.int64]]]:
+    """Return a network of whole sequences, the samples of a split, and which of them each object has."""
+    network = weights.network
+    if not network.sees_sequence:
+        raise DataError(
+            "these weights see single time steps; give those of a network of whole sequences (train with "
+            "--network.kind sequence)"
+        )
+    check_sampling(weights, dataset.sampling)
+    samples = NlosDataset(dataset, split, weights.modality)
+    if np.isnan(samples.position_m).any():
+        raise DataError("the motion of an object is unknown; give it in capture.yaml (`evnlos track` finds it)")
+    sequences = {name: np.flatnonzero(samples.names == name) for name in dict.fromkeys(samples.names.tolist())}
+    return network.eval(), samples, sequences
 
 
 def choices(positions: int, count: int) -> list[np.ndarray]:

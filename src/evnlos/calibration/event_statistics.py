@@ -325,7 +325,7 @@ def _solve(setup: str, side_m: float, folder: Path) -> _Solved | None:
     if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
         return None
     of = capture.events, capture.frame_times_us, capture.motion
-    statistic, prior, _ = event_statistic(*of, setup, side_m)
+    statistic, prior = event_statistic(*of, setup, side_m)
     return _Solved(capture.name, statistic, prior, target.rasterise(prior.target_plane))
 
 

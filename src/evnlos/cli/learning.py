@@ -23,12 +23,9 @@ from evnlos.cli.parsing import check_there, say, told_first
 from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, read_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
-from evnlos.errors import ConfigError, DataError, EvnlosError, printable
+from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.machine import ProgressBars
 from evnlos.models import (
-    GENERIC,
-    Weights,
-    describe_network,
     find_weights,
     load_weights,
     published,
@@ -205,12 +202,22 @@ class EvaluateCommand:
     images explain. By default the setup that the weights were trained for, where it is known."""
     positions: tuple[int, ...] = ()
     """Numbers of positions, e.g. 1 2 5 10 20 40: also how the image of a sequence network grows with them."""
+    so_far: bool = False
+    """Also score the image at each position that a sequence network makes of all up to it, and of nothing
+    later; --positions names those that are shown. With events of a dataset of --sampling.surface so-far."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> None:
         """Evaluate and print."""
-        from evnlos.analysis import available_lpips, curve_over_positions, evaluate, load_lpips, load_model
+        from evnlos.analysis import (
+            available_lpips,
+            curve_over_positions,
+            curve_so_far,
+            evaluate,
+            load_lpips,
+            load_model,
+        )
         from evnlos.report import refuse_seen, seen_in_training
         from evnlos.setups import lit_setup
 
@@ -222,7 +229,9 @@ class EvaluateCommand:
         known = lit_setup(self.setup) if self.setup else model.known_setup()
         curve = []
         with ProgressBars() as progress:
-            if self.positions:
+            if self.so_far:
+                curve = curve_so_far(weights, dataset, split, progress)
+            elif self.positions:
                 curve = curve_over_positions(weights, dataset, split, self.positions, progress)
             found = evaluate(weights, dataset, split, metric, known, progress).summary()
         about = {
@@ -233,11 +242,17 @@ class EvaluateCommand:
         }
         seen = seen_in_training(weights.history, dataset, split)
         if self.json:
-            points = {"positions": [to_dict(point) for point in curve]} if curve else {}
+            key = "so_far" if self.so_far else "positions"
+            points = {key: [to_dict(point) for point in curve]} if curve else {}
             print(json.dumps(about | {"seen_in_training": seen} | found | points))
         else:
             _print_summary(about, found)
-            if curve:
+            if self.so_far:
+                shown = [p for p in curve if not self.positions or p.positions in self.positions]
+                print("| positions so far | PSNR at the last, dB |\n|---|---|")
+                print("\n".join(f"| {p.positions} | {p.psnr_db:.2f} |" for p in shown))
+                print(f"| mean of all | {sum(p.psnr_db for p in curve) / len(curve):.2f} |")
+            elif curve:
                 print("| positions | choices of them | PSNR, dB |\n|---|---|---|")
                 print("\n".join(f"| {p.positions} | {p.subsets} | {p.psnr_db:.2f} |" for p in curve))
             if seen:
@@ -276,9 +291,6 @@ def _cell(value: float | None) -> str:
     return "not available" if value is None else f"{value:.3f}"
 
 
-_MOST_NAMED = 8  # of more objects, the worst and the best are named
-
-
 @dataclass(frozen=True)
 class WeightsCommand:
     """Show what weights see, how they were trained and on what, or list the pretrained ones."""
@@ -301,6 +313,8 @@ class WeightsCommand:
 
     def run(self) -> None:
         """Read the weights, print, and write the copy where one is requested."""
+        from evnlos.report.provenance import about_weights, weights_text
+
         if self.half is None and (self.rank is not None or self.scores is not None):
             raise ConfigError("--rank and --scores are of a copy; give its file with --half")
         if self.weights is None:
@@ -316,17 +330,21 @@ class WeightsCommand:
                 loaded = replace(loaded, network=loaded.network.reduced(self.rank))
             loaded = replace(loaded, scores=_scores(self.scores) if self.scores else loaded.scores)
             save_weights(self.half, loaded, torch.float16)
-        found = describe(loaded)
-        print(json.dumps(found) if self.json else to_text(str(self.weights), found))
+        found = about_weights(loaded)
+        print(json.dumps(found) if self.json else weights_text(str(self.weights), found))
         if self.half is not None and not self.json:
             print(f"{self.half}: half precision, {self.half.stat().st_size / 1e6:.1f} MB")
 
     def _list(self) -> None:
-        found = {name: describe(load_weights(path)) for name, path in published().items()}
+        from evnlos.report.provenance import about_weights, weights_text
+
+        found = {name: about_weights(load_weights(path)) for name, path in published().items()}
         if self.json:
             print(json.dumps(found))
             return
-        print("\n".join(to_text(name, about) for name, about in found.items()) or "no weights are published")
+        print(
+            "\n".join(weights_text(name, about) for name, about in found.items()) or "no weights are published"
+        )
 
 
 def _scores(path: Path) -> dict[str, Any]:
@@ -339,62 +357,3 @@ def _scores(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path} is not what `evnlos evaluate --json` prints: {error!r}"[:300]) from None
     return kept | {"data": Path(kept["data"]).name, "psnr_db": objects, "baselines": baselines}
-
-
-def describe(weights: Weights) -> dict[str, Any]:
-    """Return what a user of the weights must know, as plain values."""
-    state = weights.network.state_dict().values()
-    return {
-        **describe_network(weights.network),
-        "sees_sequence": weights.network.sees_sequence,
-        "parameters": sum(p.numel() for p in weights.network.parameters()),
-        "numbers": sum(value.numel() for value in state),
-        "history": weights.history,
-        "confidence": weights.confidence is not None,
-        "scores": weights.scores,
-        "digest": weights.is_sealed,
-    }
-
-
-def to_text(name: str, found: dict[str, Any]) -> str:
-    """Return the description as lines for people."""
-    sees = "whole sequences" if found["sees_sequence"] else "one time step at a time"
-    sampling = found["sampling"]
-    is_solved = sampling.get("surface") in ("likelihood", "corrected")
-    through = f", through the light path of {sampling.get('setup') or 'each setup'}" if is_solved else ""
-    lines = [
-        f"{name}: {found['modality']}, {found['network']['kind']}: {sees}; {found['parameters']:,} trained "
-        f"parameters, {found['numbers'] - found['parameters']:,} numbers in closed form",
-        f"  maps {sampling.get('width')} x {sampling.get('height')}, pitch {sampling.get('pitch_m')} m, "
-        f"surface {sampling.get('surface')}, tau {sampling.get('tau_s')} s{through}",
-    ]
-    if name.startswith(f"{GENERIC}-"):
-        lines.append(
-            "  layers to begin a training with, trained behind many walls: simulate your setup and give "
-            "`evnlos finetune --refit-embedding`; not for reconstructions as they are"
-        )
-        return "\n".join(lines)
-    for number, step in enumerate(found["history"], start=1):
-        data, plan = step.get("data", {}), step.get("settings", {})
-        lines.append(
-            f"  {number}. {data.get('origin')} {data.get('name')}: {len(data.get('train', []))} objects, "
-            f"{plan.get('epochs')} epochs at {plan.get('learning_rate')}, seed {plan.get('seed')}"
-        )
-    if not found["digest"]:
-        lines.append("  without a digest, as earlier versions wrote them: damage to the numbers goes unseen")
-    if found["scores"]:
-        lines.append(_score_line(found["scores"]))
-    return "\n".join(map(printable, lines))
-
-
-def _score_line(scores: dict[str, Any]) -> str:
-    """Return one line on how good the weights were found to be; a stranger's file may say anything there."""
-    try:
-        named, between = list(scores["psnr_db"].items()), ", "
-        if len(named) > _MOST_NAMED:
-            ranked = sorted(named, key=lambda pair: pair[1])
-            named, between = [ranked[0], ranked[-1]], " to "
-        each = between.join(f"{name} {value:.2f}" for name, value in named)
-        return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
-    except (KeyError, TypeError, ValueError, AttributeError):
-        return "  its scores are not what this version writes"

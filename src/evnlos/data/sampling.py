@@ -71,11 +71,14 @@ class Sampling:
     """Size of a pixel of the truth on the target's plane, metres."""
     scored_rows: int = 48
     """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
-    surface: Literal["sae", "context", "hots", "trace", "sae-trace", "likelihood", "corrected"] = "sae"
+    surface: Literal["sae", "context", "hots", "trace", "sae-trace", "likelihood", "corrected", "so-far"] = (
+        "sae"
+    )
     """Kind of the time surface; `trace` = log light smoothed over all events, also later ones; `sae-trace` =
     `sae` and, for networks of single time steps, the trace so far of 10 `tau_s`; `likelihood` = the target that
     the events of the sequence make most likely through the light path of `setup`; `corrected` = the same of
-    captures, less what other captures showed that the setup gets wrong of events."""
+    captures, less what other captures showed that the setup gets wrong of events; `so-far` = the same of the
+    events up to each time step alone."""
     tau_s: float = 0.2
     """Time constant of the time surface, seconds; of `trace`, the time in which the light changes: 1 to 5."""
     radius: int = 3
@@ -103,7 +106,7 @@ class Sampling:
     @property
     def is_solved(self) -> bool:
         """Whether the surface is the target that the events show through the light path of `setup`."""
-        return self.surface in ("likelihood", "corrected")
+        return self.surface in ("likelihood", "corrected", "so-far")
 
     def corrected_as(self, other: Sampling) -> Sampling:
         """Return it with errors taken from events as another has it, where both show the target so."""
@@ -207,7 +210,7 @@ def iter_samples(
 ) -> Iterator[Samples]:
     """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
 
-    Of traces, `likelihood` and `corrected` alone all are held at once. `capture` is the name of a recording,
+    Of traces and what is solved for the target all are held at once. `capture` is the name of a recording,
     which `corrected` takes, see `event_images`.
     """
     if len(edges_us) != len(frames) + 1:
@@ -219,7 +222,8 @@ def iter_samples(
         from evnlos.inverse.event_images import event_images  # which compiles
 
         corrects = capture if mode == "corrected" else None
-        images = event_images(events, edges_us, motion, sampling.setup, sampling.canvas, corrects)
+        those = events, edges_us, motion, sampling.setup, sampling.canvas, corrects
+        images = event_images(*those, so_far=mode == "so-far")
         surfaces = frame_blocks(images, steps)
     elif mode in _TRACES:
         surfaces = frame_blocks(_TRACES[mode](events, edges_us, tau_us), steps)

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -44,6 +45,7 @@ EVENT_ERRORS_FILE = "events.safetensors"
 _SPAN_US = 100_000  # first and last instant are multiples of it, so that clocks that jitter share a light path
 _FEWEST = 4  # captures that tell of errors
 _LEAST_GAIN_DB = 0.3
+_WORTH = 1.1  # times as many events as when the target was last solved for
 _LEAST = 1e-6  # noise of a coefficient, in the mean of all
 
 
@@ -205,26 +207,40 @@ def gains_by_errors(setup: Path) -> bool:
     return path.is_file() and EVENT_ERRORS.load(path, "").about.gain_db >= _LEAST_GAIN_DB
 
 
+class _Sequence(NamedTuple):
+    """A sequence on the clock of its light path."""
+
+    solver: EventSolver
+    prior: PatternPrior
+    events: Events
+    instants_s: NDArray[np.float64]
+    position_m: NDArray[np.float64]
+
+
 def event_statistic(
     events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str, side_m: float
-) -> tuple[EventStatistic, PatternPrior, NDArray[np.float64]]:
-    """Return what all events of a sequence say of the target through a setup.
+) -> tuple[EventStatistic, PatternPrior]:
+    """Return what all events of a sequence say of the target through a setup, and the prior that it is about.
 
     Arguments and errors as of `event_images`; `side_m` is the side of the target plane, metres.
-
-    Returns:
-        Information and score, the prior over targets that they are about, and where the target is at each edge
-        but the first, (x, y) in metres, [N, 2].
     """
+    found = _sequence(events, edges_us, motion, setup, side_m)
+    with threadpool_limits(1):  # its products are small: a second thread mostly waits
+        return found.solver(found.events), found.prior
+
+
+def _sequence(
+    events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str, side_m: float
+) -> _Sequence:
     if not setup:
         raise ConfigError(
-            "Sampling.setup is empty; the surface 'likelihood' undoes the light path of a setup: give the "
-            "folder of `evnlos calibrate`"
+            "Sampling.setup is empty; the surfaces 'likelihood' and 'so-far' undo the light path of a setup: "
+            "give the folder of `evnlos calibrate`"
         )
     if motion is None:
         raise DataError(
-            "the motion is unknown, and the surface 'likelihood' needs it; state it in capture.yaml (`evnlos "
-            "track` finds it)"
+            "the motion is unknown, and the surfaces 'likelihood' and 'so-far' need it; state it in "
+            "capture.yaml (`evnlos track` finds it)"
         )
     edges_us = np.asarray(edges_us, np.int64)
     if isinstance(motion, LineMotion):  # on the motion's own clock the recordings of a setup share a light path
@@ -234,8 +250,8 @@ def event_statistic(
     span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
     solver, prior = _solver(setup, motion, span, (events.height, events.width), side_m)
     note("what the events say")
-    with threadpool_limits(1):  # its products are small: a second thread mostly waits
-        return solver(events), prior, motion.position_m(edges_us[1:] * 1e-6)
+    instants_s = np.asarray(edges_us[1:] * 1e-6, np.float64)
+    return _Sequence(solver, prior, events, instants_s, motion.position_m(instants_s))
 
 
 def event_images(
@@ -245,6 +261,8 @@ def event_images(
     setup: str,
     canvas: Plane,
     capture: str | None = None,
+    *,
+    so_far: bool = False,
 ) -> NDArray[np.float32]:
     """Return the target that all events of a sequence show, where it is at each edge: float32 [N, 2, h, w].
 
@@ -258,20 +276,38 @@ def event_images(
         canvas: What is drawn.
         capture: Name of the capture, whose sensor errs as other captures of the setup showed (`EventErrors`);
             None: the setup counts as right.
+        so_far: Whether each image knows the events up to its edge alone. The target is solved for again where
+            there are a tenth more than when it was last, and at the last edge.
 
     Raises:
         ConfigError: No setup is named, it is not linear, or its event model states no law of its crossings.
         DataError: The motion is unknown, or the file of errors is damaged or not there.
     """
     errors = None if capture is None else event_errors(setup, "give --sampling.surface likelihood")
-    statistic, prior, places = event_statistic(events, edges_us, motion, setup, target_side_m(canvas))
-    if errors is not None and capture is not None:
-        statistic = errors.corrected(statistic, capture)
-    images = []
-    for z in statistic.solutions(EVENT_PRIORS):
-        mask = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)
-        images.append(Target("events", mask, prior.target_plane.extent_m[0]).rasterise(canvas, places))
-    return np.stack(images, axis=1)
+    seen = _sequence(events, edges_us, motion, setup, target_side_m(canvas))
+    side_m, places = seen.prior.target_plane.extent_m[0], seen.position_m
+    steps = _worth_solving(seen) if so_far else [0]
+    until = seen.instants_s[steps] if so_far else seen.solver.light.times_s[-1:]
+    with threadpool_limits(1):
+        found = seen.solver.so_far(seen.events, until)
+        images = np.empty((len(places), len(EVENT_PRIORS), canvas.height, canvas.width), np.float32)
+        for first, after, statistic in zip(steps, [*steps[1:], len(places)], found, strict=True):
+            if errors is not None and capture is not None:
+                statistic = errors.corrected(statistic, capture)
+            for k, z in enumerate(statistic.solutions(EVENT_PRIORS)):
+                target = Target("events", np.clip(seen.prior.image(z), 0.0, 1.0).astype(np.float32), side_m)
+                images[first:after, k] = target.rasterise(canvas, places[first:after])
+    return images
+
+
+def _worth_solving(seen: _Sequence) -> list[int]:
+    """Return at which steps enough events came since the step before to solve for the target again."""
+    counts = np.searchsorted(seen.events.t_us, np.round(1e6 * seen.instants_s), side="right")
+    steps, last = list[int](), len(counts) - 1
+    for step, count in enumerate(counts.tolist()):
+        if not steps or step == last or count > _WORTH * counts[steps[-1]]:
+            steps.append(step)
+    return steps
 
 
 def event_prior(setup: Setup, side_m: float, patterns: int = COEFFICIENTS) -> PatternPrior:

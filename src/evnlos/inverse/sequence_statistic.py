@@ -16,6 +16,7 @@ information A and score b about the coefficients z of the prior, is all that the
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -178,10 +179,23 @@ class EventSolver:
 
     def __call__(self, events: Events) -> EventStatistic:
         """Return the statistic of a sequence's events, on the clock of the light."""
-        span = (float(self.light.times_s[0]), float(self.light.times_s[-1]))
+        return self._solved(events, float(self.light.times_s[-1]), np.zeros(self._seen.shape[2] + 1))
+
+    def so_far(self, events: Events, instants_s: Array) -> Iterator[EventStatistic]:
+        """Yield the statistic of the events up to each instant; each estimate starts from the one before.
+
+        Args:
+            events: Of the whole sequence, on the clock of the light.
+            instants_s: Ascending, within the light's, seconds.
+        """
+        unknown = np.zeros(self._seen.shape[2] + 1)
+        for until_s in instants_s.tolist():
+            yield self._solved(events, until_s, unknown)
+
+    def _solved(self, events: Events, until_s: float, unknown: Array) -> EventStatistic:
+        span = (float(self.light.times_s[0]), until_s)
         record, last = record_of(events, self.law, span, self.settings.gap_s), self.settings.least_noise
         row, column = np.divmod(record.pixel, events.width)
-        unknown = np.zeros(self._seen.shape[2] + 1)
         shares = np.minimum(np.arange(_FIRST_STEPS) / _ANNEALED, 1.0)
         noises = self.settings.first_noise ** (1 - shares) * last**shares
         for stride, solver in self._coarse:

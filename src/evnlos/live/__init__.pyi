@@ -6,6 +6,7 @@ from .device import CameraLostError as CameraLostError
 from .device import CameraPacket as CameraPacket
 from .device import DeviceSource as DeviceSource
 from .device import NeuromorphicDriver as NeuromorphicDriver
+from .engine import StreamingReconstructor as StreamingReconstructor
 from .record import RecordingCheck as RecordingCheck
 from .record import check_line as check_line
 from .record import record_capture as record_capture

@@ -562,16 +562,18 @@ class SequenceReconstructor(Reconstructor):
         Args:
             inputs: What was recorded at N time steps, [N, C, H, W].
             position_m: The plane's centre on the canvas, (x, y) in metres, [N, 2].
-            kept: 1 where a subset has a time step, else 0, float32 [K, N].
+            kept: 1 where a subset has a time step, else 0, float32 [K, N]; its last `so-far` surface counts.
             frames: What frames are solved through; by default the network's own.
 
         Raises:
             DataError: The plane is off the canvas at all time steps of a subset.
         """
         total = seen = torch.zeros((), device=inputs.device)
+        last = F.one_hot(kept.cumsum(dim=1).argmax(dim=1), len(inputs)).to(kept)
+        shown = last if self.sampling.surface == "so-far" else kept
         for start in range(0, len(inputs), 64):
             part = slice(start, start + 64)
-            weights = kept[:, part].to(inputs.device)
+            weights = shown[:, part].to(inputs.device)
             if self.embedding.images:
                 embedded = self.embedding(self.normalization(inputs[part].float()))
                 light, inside = self.grid.seen(embedded, position_m[part])

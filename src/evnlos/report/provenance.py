@@ -2,6 +2,7 @@
 
 - The commands that make a report again, and the files of settings that they read.
 - How a report was made: machine and versions, the commands that make it again, all settings.
+- What weights see, how they were trained, and how good they were found to be.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ import torch
 import yaml
 
 from evnlos.data import Dataset, Sampling
+from evnlos.errors import printable
+from evnlos.models import GENERIC, Weights, describe_network
 from evnlos.registry import __version__
 from evnlos.report.tables import RunResult
 from evnlos.setups import NamedSetup
 
 _SETUP = "calibrated"  # the folder whose fixed pattern is taken from the frames
+_MOST_NAMED = 8  # of more objects, the worst and the best are named
 _LIVE = "live"  # what a simulation is called that is made while the network trains
 
 
@@ -225,3 +229,62 @@ def environment() -> str:
             continue
     system = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads, {device}"
     return f"{', '.join(parts)}; {system}"
+
+
+def about_weights(weights: Weights) -> dict[str, Any]:
+    """Return what a user of the weights must know, as plain values."""
+    state = weights.network.state_dict().values()
+    return {
+        **describe_network(weights.network),
+        "sees_sequence": weights.network.sees_sequence,
+        "parameters": sum(p.numel() for p in weights.network.parameters()),
+        "numbers": sum(value.numel() for value in state),
+        "history": weights.history,
+        "confidence": weights.confidence is not None,
+        "scores": weights.scores,
+        "digest": weights.is_sealed,
+    }
+
+
+def weights_text(name: str, found: dict[str, Any]) -> str:
+    """Return the description as lines for people."""
+    sees = "whole sequences" if found["sees_sequence"] else "one time step at a time"
+    sampling = found["sampling"]
+    is_solved = sampling.get("surface") in ("likelihood", "corrected", "so-far")
+    through = f", through the light path of {sampling.get('setup') or 'each setup'}" if is_solved else ""
+    lines = [
+        f"{name}: {found['modality']}, {found['network']['kind']}: {sees}; {found['parameters']:,} trained "
+        f"parameters, {found['numbers'] - found['parameters']:,} numbers in closed form",
+        f"  maps {sampling.get('width')} x {sampling.get('height')}, pitch {sampling.get('pitch_m')} m, "
+        f"surface {sampling.get('surface')}, tau {sampling.get('tau_s')} s{through}",
+    ]
+    if name.startswith(f"{GENERIC}-"):
+        lines.append(
+            "  layers to begin a training with, trained behind many walls: simulate your setup and give "
+            "`evnlos finetune --refit-embedding`; not for reconstructions as they are"
+        )
+        return "\n".join(lines)
+    for number, step in enumerate(found["history"], start=1):
+        data, plan = step.get("data", {}), step.get("settings", {})
+        lines.append(
+            f"  {number}. {data.get('origin')} {data.get('name')}: {len(data.get('train', []))} objects, "
+            f"{plan.get('epochs')} epochs at {plan.get('learning_rate')}, seed {plan.get('seed')}"
+        )
+    if not found["digest"]:
+        lines.append("  without a digest, as earlier versions wrote them: damage to the numbers goes unseen")
+    if found["scores"]:
+        lines.append(_score_line(found["scores"]))
+    return "\n".join(map(printable, lines))
+
+
+def _score_line(scores: dict[str, Any]) -> str:
+    """Return one line on how good the weights were found to be; a stranger's file may say anything there."""
+    try:
+        named, between = list(scores["psnr_db"].items()), ", "
+        if len(named) > _MOST_NAMED:
+            ranked = sorted(named, key=lambda pair: pair[1])
+            named, between = [ranked[0], ranked[-1]], " to "
+        each = between.join(f"{name} {value:.2f}" for name, value in named)
+        return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return "  its scores are not what this version writes"
