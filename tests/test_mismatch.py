@@ -12,7 +12,7 @@ from evnlos.demo import ROBUST, Demo, run_demo
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import Record, Study, write_record
 from evnlos.models import layers_of
-from evnlos.studies import finding, mismatch_table, run_mismatch
+from evnlos.studies import finding, lead_figure, leads_of, mismatch_table, run_mismatch
 
 CAPTURE = "camera: {name: a camera, width: 40, height: 25}\n"
 LEFT = {
@@ -29,7 +29,8 @@ def keep(out: Path, seed: int, scores: dict[tuple[str, str], float], warnings: l
     for (arm, modality), value in scores.items():
         mean = {"mean": {"psnr_db": {"x_G": 13.0, "x_K": 14.0}}}
         means = {"psnr_db": {"x_G": value - 1, "x_K": value + 1}}
-        record = Record("demo", "demo", arm, modality, seed, "test", means, {}, mean, {}, {})
+        positions = {"x_G": [value - 1, value - 1], "x_K": [value + 1, value + 1]}
+        record = Record("demo", "demo", arm, modality, seed, "test", means, positions, mean, {}, {})
         write_record(record, out / "records" / "demo")
     setup = out / "setups" / "demo"
     setup.mkdir(parents=True, exist_ok=True)
@@ -53,7 +54,7 @@ def test_a_row_holds_residuals_the_strongest_e2e_and_the_lead_of_epnp(tmp_path):
     assert math.isnan(found.of("EPNP", "event")) and math.isnan(found.best_e2e("event"))
     assert found.left == {"frames": (0.07, 0.035), "surfaces": (0.97, 0.36)}
     text = mismatch_table([found])
-    assert "| a | frame | 7.0 / 3.5 | 13.50 | 21.00 | 18.50 | 22.50 | +1.50 |" in text
+    assert "| a | frame | 7.0 / 3.5 | 13.50 | 21.00 | 18.50 | 22.50 | +1.50 [+0.50, +2.50] |" in text
     assert "EPNP - E2E +1.50 dB in the mean, +1.50 at least (a); simulation only - mean image +5.00" in text
     assert "warned of the wall may be of another kind" in text
 
@@ -66,6 +67,23 @@ def test_the_least_lead_is_named(tmp_path):
     assert "EPNP - E2E +0.75 dB in the mean, -0.50 at least (two)" in text
     assert "| two | event | 97.0 / 36.0 |" in text
     assert "- two: the calibration warned of nothing; it expected: ahead." in text
+
+
+def test_the_leads_are_drawn_as_the_table_has_them(tmp_path):
+    scores = {("E2E", "frame"): 20.0, ("simulation only", "frame"): 18.0, ("EPNP", "frame"): 22.0}
+    keep(tmp_path / "one", 0, scores, [])
+    keep(tmp_path / "two", 0, scores | {("E2E", "event"): 16.0, ("EPNP", "event"): 15.5}, [])
+    keep(tmp_path / "no", 0, {("EPNP", "frame"): 22.0}, [])
+    leads = leads_of([finding(name, [tmp_path / name]) for name in ("one", "two", "no")])
+    assert set(leads) == {("one", "frame"), ("two", "frame"), ("two", "event")}
+    assert leads["one", "frame"] == pytest.approx((20.0, 18.0, 22.0, 2.0, 2.0, 2.0))
+    pytest.importorskip("matplotlib")
+    left, right = lead_figure(leads).axes
+    assert [label.get_text() for label in left.get_yticklabels()] == ["one", "two"]
+    drawn = sorted(float(line.get_xdata()[0]) for line in right.lines if line.get_marker() == "o")
+    assert drawn == pytest.approx([-0.5, 2.0, 2.0])
+    with pytest.raises(DataError, match="no setup has both"):
+        lead_figure({})
 
 
 def test_each_setup_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
@@ -107,7 +125,7 @@ def test_robust_networks_stand_beside_the_others(tmp_path, monkeypatch):
     found = run_mismatch(Demo(out=tmp_path / "out", robust=True), (), tmp_path / "captures")
     table = mismatch_table(found)
     assert "| EPNP - E2E | simulation only, robust | EPNP, robust |" in table
-    assert "| 20.00 | 18.00 | 22.00 | +2.00 | 18.50 | 22.50 |" in table
+    assert "| 20.00 | 18.00 | 22.00 | +2.00 [+2.00, +2.00] | 18.50 | 22.50 |" in table
 
 
 @pytest.mark.parametrize("start", ["generic", "nowhere", ""])

@@ -144,52 +144,34 @@ def draw_table() -> None:
     figure.savefig(ROOT / "docs" / "figures" / "results_near.png", dpi=110)
 
 
-def rows_of_rooms(page: str) -> dict[tuple[str, str], list[float]]:
+def rows_of_rooms(page: str) -> dict[tuple[str, str], tuple[float, ...]]:
     """Return E2E, simulation only, EPNP, its lead and the ends of its interval, dB, by room and modality.
 
     Args:
         page: Text of the page on walls; the rows of its table of all rooms count.
     """
-    room, found = "", dict[tuple[str, str], list[float]]()
+    room, found = "", dict[tuple[str, str], tuple[float, ...]]()
     for line in page.splitlines():
         cells = [cell.strip(" `") for cell in line.strip("|").split("|")]
         if len(cells) == 8 and cells[1] in SEES and cells[-1].endswith("]"):
             room = cells[0] or room
             values = re.findall(r"[+-]?[0-9.]+", " ".join(cells[4:]))
-            found[room, SEES[cells[1]]] = [float(value) for value in values]
+            found[room, SEES[cells[1]]] = tuple(float(value) for value in values)
     return found
 
 
-def digest_of(rows: dict[tuple[str, str], list[float]]) -> str:
+def digest_of(rows: dict[tuple[str, str], tuple[float, ...]]) -> str:
     """Return what tells whether a figure shows these rows."""
     return hashlib.sha256(repr(sorted(rows.items())).encode()).hexdigest()[:16]
 
 
 def draw_walls() -> None:
     """Draw PSNR of the three networks of each room, and the lead of EPNP with its 95 % interval."""
+    from evnlos.studies import lead_figure
+
     rows = rows_of_rooms(WALLS.read_text(encoding="utf-8"))
-    rooms = list(dict.fromkeys(room for room, _ in rows))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 6), sharey=True, layout="constrained")
-    for (room, modality), (e2e, simulated, epnp, lead, low, high) in rows.items():
-        y = -rooms.index(room) - 0.25 * (list(COLOURS).index(modality) - 1)
-        colour, is_first = COLOURS[modality], room == rooms[0]
-        left.plot([e2e, epnp], [y, y], "-", color=colour, alpha=0.3, lw=1.5)
-        for value, mark, name in ((e2e, "|", "E2E"), (simulated, ".", "simulation only"), (epnp, "o", "EPNP")):
-            label = name if is_first and modality == "frame" else None
-            left.plot(value, y, mark, color=colour, ms=9 if mark == "|" else 5, label=label)
-        bar = [[lead - low], [high - lead]]
-        label = modality if is_first else None
-        right.errorbar(lead, y, xerr=bar, fmt="o", color=colour, ms=4, capsize=2, lw=1, label=label)
-    right.axvline(0, color="#888888", ls="--", lw=1)
-    left.set_yticks(-np.arange(len(rooms)), rooms)
-    left.set_xlabel("PSNR, dB (mean of four held-out characters)")
-    right.set_xlabel("EPNP less the strongest E2E, dB (95 % interval)")
-    for axes in (left, right):
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="x", alpha=0.25)
     told = {"Description": digest_of(rows), "Software": None}
-    figure.savefig(ROOT / "docs" / "figures" / "walls.png", dpi=110, metadata=told)
+    lead_figure(rows).savefig(ROOT / "docs" / "figures" / "walls.png", dpi=110, metadata=told)
 
 
 if __name__ == "__main__":

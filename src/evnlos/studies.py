@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,18 +15,20 @@ from typing import Any
 import numpy as np
 
 from evnlos.analysis import available_lpips, evaluate
+from evnlos.analysis.scores import Interval
 from evnlos.calibration import CALIBRATION_VALUES_FILE
 from evnlos.config import config_hash, to_dict, write_atomically
 from evnlos.data import STANDARD_MODALITIES, Simulation, simulate
 from evnlos.data.lab import lab_of, render_captures
 from evnlos.data.simulations import paper
 from evnlos.demo import ROBUST, Demo, run_demo
-from evnlos.errors import CalibrationError, UnknownNameError
-from evnlos.experiment import Record, means_of, read_records
+from evnlos.errors import CalibrationError, DataError, UnknownNameError
+from evnlos.experiment import Record, difference, means_of, read_records
 from evnlos.experiment.run import Run, train_one
 from evnlos.experiment.study import is_scored, keep_scores, records_there
 from evnlos.machine import Progress, silent
 from evnlos.models import load_weights
+from evnlos.plot.figures import new_figure
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
 from evnlos.setups import ROOMS, SensorSize
 from evnlos.training import Training
@@ -143,6 +146,7 @@ class Finding:
         left: "frames" or "surfaces" (of events) -> (residual on held-out captures, what noise leaves), shares.
         mean_image_db: Modality -> PSNR of the mean image, dB.
         psnr_db: (arm, modality) -> PSNR of each seed, dB.
+        leads_db: Modality -> what EPNP is ahead of the strongest end-to-end arm, dB.
     """
 
     setup: str
@@ -152,11 +156,12 @@ class Finding:
     left: dict[str, tuple[float, float]]
     mean_image_db: dict[str, float]
     psnr_db: dict[tuple[str, str], list[float]]
+    leads_db: dict[str, Interval]
 
     def best_e2e(self, modality: str) -> float:
         """Return the mean PSNR of the strongest end-to-end arm, dB; NaN where there is none."""
-        values = [np.mean(v) for (arm, p), v in self.psnr_db.items() if arm.startswith("E2E") and p == modality]
-        return float(max(values, default=np.nan))
+        name = _strongest(self.psnr_db, modality)
+        return self.of(name, modality) if name else math.nan
 
     def of(self, arm: str, modality: str) -> float:
         """Return the mean PSNR of an arm over its seeds, dB; NaN where it was not run."""
@@ -205,6 +210,12 @@ def run_mismatch(
         found.append(finding(name, outs))
         write_atomically(base.out / "mismatch.md", mismatch_table(found).encode())
     return found
+
+
+def _strongest(psnr_db: dict[tuple[str, str], list[float]], modality: str) -> str | None:
+    """Return the name of the end-to-end arm with the largest mean PSNR; None where there is none."""
+    means = {arm: np.mean(v) for (arm, p), v in psnr_db.items() if arm.startswith("E2E") and p == modality}
+    return max(means, key=means.__getitem__, default=None)
 
 
 def mismatch_setups(asked: tuple[str, ...] = (), captures: Path | None = None) -> tuple[str, ...]:
@@ -256,7 +267,12 @@ def finding(setup: str, outs: list[Path]) -> Finding:
     warnings = dict.fromkeys(line for one in figures for line in one["warnings"])
     words = refused[0].read_text() if refused else ""
     expected = next((str(one["expectation"]) for one in figures if one.get("expectation")), "")
-    return Finding(setup, words, tuple(warnings), expected, left, mean_image, means_of(records))
+    psnr_db, leads = means_of(records), dict[str, Interval]()
+    for modality in mean_image:
+        other = _strongest(psnr_db, modality)
+        if other is not None and ("EPNP", modality) in psnr_db:
+            leads[modality] = difference(records, "EPNP", other, modality)
+    return Finding(setup, words, tuple(warnings), expected, left, mean_image, psnr_db, leads)
 
 
 def _left(residuals: dict[str, dict[str, float]], kind: str) -> tuple[float, float] | None:
@@ -283,9 +299,10 @@ def mismatch_table(found: list[Finding]) -> str:
             left = "; ".join(
                 f"{100 * a:.1f} / {100 * b:.1f}" for a, b in (one.left[k] for k in kinds if k in one.left)
             )
-            e2e, epnp = one.best_e2e(modality), one.of("EPNP", modality)
-            numbers = (one.mean_image_db[modality], e2e, one.of("simulation only", modality), epnp)
-            cells = [one.setup, modality, left, *(f"{v:.2f}" for v in numbers), f"{epnp - e2e:+.2f}"]
+            three = (one.best_e2e(modality), *(one.of(arm, modality) for arm in ("simulation only", "EPNP")))
+            numbers = (one.mean_image_db[modality], *three)
+            cells = [one.setup, modality, left, *(f"{v:.2f}" for v in numbers)]
+            cells.append(str(one.leads_db.get(modality, "")))
             cells += [f"{one.of(arm, modality):.2f}" for arm in drawn]
             lines.append(f"| {' | '.join(cells)} |")
         if one.refused:
@@ -297,13 +314,12 @@ def _margins(found: list[Finding]) -> list[str]:
     """Return a line for each modality: by how much EPNP leads, in the mean and where it leads least."""
     lines = []
     for modality in STANDARD_MODALITIES:
-        lead = {one.setup: one.of("EPNP", modality) - one.best_e2e(modality) for one in found}
+        lead = {one.setup: one.leads_db[modality].mean for one in found if modality in one.leads_db}
         above = {
             one.setup: one.of("simulation only", modality) - one.mean_image_db[modality]
             for one in found
             if modality in one.mean_image_db
         }
-        lead = {setup: value for setup, value in lead.items() if np.isfinite(value)}
         if not lead:
             continue
         least, lowest = min(lead, key=lead.__getitem__), min(above, key=above.__getitem__)
@@ -323,3 +339,62 @@ def _said(found: list[Finding]) -> list[str]:
         expected = f"; it expected: {one.expected}" if one.expected else ""
         lines.append(f"- {one.setup}: the calibration warned of {words}{expected}.")
     return lines
+
+
+Leads = dict[tuple[str, str], tuple[float, ...]]
+"""(Setup, modality) -> PSNR of E2E, of the simulation alone and of EPNP, its lead and the ends of that, dB."""
+
+_COLOURS = {"frame": "#0072b2", "event": "#d55e00", "fusion": "#009e73"}
+
+
+def leads_of(found: list[Finding]) -> Leads:
+    """Return what `lead_figure` draws.
+
+    Args:
+        found: What came of each setup.
+    """
+    return {
+        (one.setup, modality): (
+            one.best_e2e(modality),
+            one.of("simulation only", modality),
+            one.of("EPNP", modality),
+            *(lead.mean, lead.low, lead.high),
+        )
+        for one in found
+        for modality, lead in one.leads_db.items()
+    }
+
+
+def lead_figure(leads: Leads) -> Any:
+    """Return a figure: PSNR of three networks of each setup, and what EPNP leads by, with its interval.
+
+    Args:
+        leads: What is drawn.
+
+    Raises:
+        MissingDependencyError: Matplotlib is not installed.
+        DataError: There is nothing to draw.
+    """
+    setups = list(dict.fromkeys(setup for setup, _ in leads))
+    if not setups:
+        raise DataError("no setup has both EPNP and an end-to-end training to draw")
+    figure = new_figure((9, 1.2 + 0.4 * len(setups)))
+    left, right = figure.subplots(1, 2, sharey=True)
+    for (setup, modality), (e2e, simulated, epnp, lead, low, high) in leads.items():
+        y = -setups.index(setup) - 0.25 * (list(_COLOURS).index(modality) - 1)
+        colour, is_first = _COLOURS[modality], setup == setups[0]
+        left.plot([e2e, epnp], [y, y], "-", color=colour, alpha=0.3, lw=1.5)
+        for value, mark, name in ((e2e, "|", "E2E"), (simulated, ".", "simulation only"), (epnp, "o", "EPNP")):
+            label = name if is_first and modality == "frame" else None
+            left.plot(value, y, mark, color=colour, ms=9 if mark == "|" else 5, label=label)
+        bar, label = [[lead - low], [high - lead]], modality if is_first else None
+        right.errorbar(lead, y, xerr=bar, fmt="o", color=colour, ms=4, capsize=2, lw=1, label=label)
+    right.axvline(0, color="#888888", ls="--", lw=1)
+    left.set_yticks([-float(number) for number in range(len(setups))], setups)
+    left.set_xlabel("PSNR, dB (mean of the held-out characters)")
+    right.set_xlabel("EPNP less the strongest E2E, dB (95 % interval)")
+    for axes in (left, right):
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="x", alpha=0.25)
+    return figure

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -167,14 +168,13 @@ class ExperimentCommand:
         text = _tables(name, records, self.metric)
         text += experiment.bounds_table(studies[0].setup_folder(self.out), folders[0], self.captures_of)
         name = f"{name}-{self.captures_of}-{study.split}"
-        self._tell(name, text, lambda image: draw_scores(records, self.metric, image))
+        self._tell(name, text, partial(draw_scores, records, self.metric))
 
-    def _tell(self, name: str, text: str, draw: Callable[[Path], object] | None = None) -> None:
+    def _tell(self, name: str, text: str, draw: Callable[[Path], object]) -> None:
         """Write a table and print it; draw the image that goes with it."""
         write_atomically(self.out / f"{name}.md", text.encode())
         print(text)
-        if draw is not None:
-            drawn(image := self.out / f"{name}.png", lambda: draw(image))
+        drawn(image := self.out / f"{name}.png", lambda: draw(image))
 
     def _study(self) -> Study:
         """Return the named study with what the command line changes."""
@@ -203,13 +203,12 @@ class ExperimentCommand:
         """Return an arm with the epochs that were asked for."""
         pre, fine = arm.pretraining, arm.finetuning
         tuned = self.finetune_epochs if pre else self.e2e_epochs
-        if pre and self.pretrain_epochs:
-            pre = replace(pre, epochs=self.pretrain_epochs)
-        if fine and tuned:
-            fine = replace(fine, epochs=tuned)
+        pre = pre and replace(pre, epochs=self.pretrain_epochs or pre.epochs)
+        fine = fine and replace(fine, epochs=tuned or fine.epochs)
         return replace(arm, pretraining=pre, finetuning=fine)
 
     def _simulation(self) -> None:
+        from evnlos.plot.figures import draw_scores
         from evnlos.studies import SIMULATION, Simulated, run_simulated
 
         asked = ("out", "modalities", "seeds", "workers", "force")
@@ -221,18 +220,19 @@ class ExperimentCommand:
         with ProgressBars() as progress:
             run_simulated(settings, progress)
         everything = experiment.read_records(self.out / "records" / SIMULATION)
-        each = ([r for r in everything if r.setup == tested] for tested in ("nist", "comic"))
-        self._tell("simulation", "".join(_tables("simulation", those, self.metric) + "\n" for those in each))
+        for tested in ("nist", "comic"):
+            those = [record for record in everything if record.setup == tested]
+            text = _tables("simulation", those, self.metric)
+            self._tell(f"simulation-{tested}", text, partial(draw_scores, those, self.metric))
 
     def _conditions(self) -> None:
         from evnlos.plot.figures import draw_regimes
 
-        out, shown = self.out / "conditions", self.out / "regimes.png"
+        out = self.out / "conditions"
         with ProgressBars() as progress:
             found = experiment.sweep_parameters(experiment.conditions(), out, self.workers, progress=progress)
             mapped = experiment.sweep_parameters(experiment.regimes(), out, self.workers, "", progress)
-        self._tell("conditions", experiment.conditions_table(found) + "\n")
-        drawn(shown, lambda: draw_regimes(mapped, shown))
+        self._tell("conditions", experiment.conditions_table(found) + "\n", partial(draw_regimes, mapped))
 
     def _generalization(self) -> None:
         from evnlos.plot.results import draw_confidence
@@ -248,11 +248,11 @@ class ExperimentCommand:
         name = f"generalization-{self.captures_of}-{weights.stem}"
         experiment.write_generalization(found, self.out / f"{name}.json")
         checks = {one.name: one.confidence_checks for one in found}
-        text = experiment.generalization_table(found) + "\n"
-        self._tell(name, text, lambda image: draw_confidence(checks, image))
+        self._tell(name, experiment.generalization_table(found) + "\n", partial(draw_confidence, checks))
 
     def _mismatch(self) -> None:
-        from evnlos.studies import mismatch_table, run_mismatch
+        from evnlos.plot.figures import save_figure
+        from evnlos.studies import lead_figure, leads_of, mismatch_table, run_mismatch
 
         names = ("out", "test", "modalities", "workers", "force", "robust", "writers")
         names += ("pretrain_epochs", "finetune_epochs", "e2e_epochs")
@@ -264,7 +264,7 @@ class ExperimentCommand:
             fitted = self.out / f"{setup}-seed{self.seeds[0]}" / "setups" / "demo"
             first = min((captures / setup).glob("*/capture.yaml")).parent
             text += experiment.bounds_table(fitted, first, setup)
-        self._tell("mismatch", text)
+        self._tell("mismatch", text, lambda image: save_figure(lead_figure(leads_of(found)), image, dpi=110))
 
 
 def _tables(name: str, records: list, metric: str) -> str:
