@@ -20,6 +20,7 @@ from evnlos.config import load_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
 from evnlos.errors import DataError, MissingDependencyError
 from evnlos.machine import Step
+from evnlos.metrics import psnr
 from evnlos.models import (
     ConfidenceReport,
     FrameOperator,
@@ -364,6 +365,26 @@ def test_all_say_the_same_of_a_setup_and_of_a_recording(default_capture, tmp_pat
     assert meaning in page and meaning in unescape(limits_section(limits)) and meaning in limits.verdict
     main(["identify", str(published_setup("near-frame-sequence")), "--quiet"])
     assert meaning in capsys.readouterr().out  # on its finer grid
+
+
+def test_images_so_far_are_many_and_leave_the_model_as_it_was(default_capture, tmp_path) -> None:
+    """One image a position, the last that of the whole recording; how far to believe them is not said."""
+    model = load_model("near-frame-sequence")
+    whole = model.reconstruct(default_capture)
+    found = reconstruct_capture(default_capture, "near-frame-sequence", tmp_path / "out", so_far=True)
+    images = np.load(tmp_path / "out" / "reconstruction.npy")
+    assert not found["one_picture"] and "--so-far" in found["no_confidence"] and "confidence" not in found
+    assert len(list((tmp_path / "out").glob("position_*.png"))) == len(images) == found["positions"]
+    scores = psnr(torch.from_numpy(images), torch.from_numpy(whole.samples.truth))
+    assert scores[-5:].mean() > scores[:5].mean() + 1
+    events = load_model("near-event-sequence")
+    late = events.reconstruct(default_capture, so_far=True)
+    assert late.confidence is None and events.weights.sampling.surface == "likelihood"
+    images = events.reconstruct(default_capture).images
+    assert (
+        torch.square(late.images[-1] - images[-1]).mean()
+        < 0.1 * torch.square(late.images[0] - images[0]).mean()
+    )
 
 
 def test_own_weights_know_the_setup_that_their_samples_name(tmp_path) -> None:

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from evnlos.errors import DataError
+from evnlos.inverse import left_out_errors
 from evnlos.models import fit_linear
-from evnlos.models.reconstructor import RIDGES, left_out_errors
+from evnlos.models.reconstructor import RIDGES
 
 
 def world(noise: float, objects: int = 30, positions: int = 10, seed: int = 0):
@@ -50,7 +51,7 @@ def test_errors_on_objects_left_out_are_those_of_one_regression_for_each_ridge()
         ridge = regularization * inner.diagonal().mean() * torch.eye(40, dtype=torch.float64)
         plain.append((code[left].double() @ torch.linalg.solve(inner + ridge, outer) - y[left]).square().sum())
     rest, aim = code[left].double(), y[left].double()
-    found = left_out_errors(inner, outer, rest.T @ rest, rest.T @ aim) + aim.square().sum()
+    found = left_out_errors(inner, outer, rest.T @ rest, rest.T @ aim, RIDGES) + aim.square().sum()
     torch.testing.assert_close(found, torch.stack(plain), rtol=1e-5, atol=0)
 
 

@@ -206,9 +206,10 @@ def test_of_surfaces_so_far_the_last_one_counts() -> None:
 
 
 def test_surfaces_that_know_later_events_are_refused(tiny_dataset) -> None:
-    weights = Weights(NET.build("event", tiny_dataset.sampling))
+    later = replace(tiny_dataset, sampling=replace(tiny_dataset.sampling, surface="trace"))
+    weights = Weights(NET.build("event", later.sampling))
     with pytest.raises(DataError, match=r"--sampling\.surface so-far"):
-        curve_so_far(weights, tiny_dataset, "train")
+        curve_so_far(weights, later, "train")
 
 
 def test_evaluate_prints_the_curve(trained, tiny_dataset, capsys) -> None:

@@ -287,8 +287,8 @@ def evaluate(
     check_sampling(weights, dataset.sampling)
     samples = NlosDataset(dataset, split, weights.modality)
     progress(Step("evaluate", 0, 3, "stages", within=f"reconstruct {len(samples)} images"))
-    weights.network.sampling = weights.sampling.corrected_as(dataset.sampling)
-    images = weights.network.infer(samples.inputs, samples.position_m, samples.names)
+    network = weights.network.seeing(dataset.sampling)
+    images = network.infer(samples.inputs, samples.position_m, samples.names)
     progress(Step("evaluate", 1, 3, "stages", within="scores and baselines"))
     found = assess(images, samples, dataset, split, weights.mean_image, perceptual)
     progress(Step("evaluate", 2, 3, "stages", within="confidence"))
@@ -298,7 +298,7 @@ def evaluate(
     canvas = dataset.sampling.canvas
     checks_frames = setup is not None and "frame" in weights.modality.slices
     operator = FrameOperator(setup, dataset.sampling) if setup is not None and checks_frames else None
-    confidence_checks = check_confidence(weights.network, weights.confidence, samples, images, canvas, operator)
+    confidence_checks = check_confidence(network, weights.confidence, samples, images, canvas, operator)
     progress(Step("evaluate", 3, 3, "stages"))
     return replace(found, confidence_checks=confidence_checks)
 
@@ -390,7 +390,7 @@ def check_sampling(weights: Weights, sampling: Sampling) -> None:
     made_for, these = weights.sampling, sampling if weights.modality.needs_events else sampling.of_frames()
     # Only this surface is made through the setup, which may have been moved.
     is_known = not made_for.is_solved or same_setup(made_for.setup, these.setup)
-    these = these.corrected_as(made_for)  # the maps are alike whether errors are taken from them
+    these = these.shown_as(made_for)  # the maps are alike whether errors are taken from them
     if not is_known or replace(made_for, setup="") != replace(these, setup=""):
         differ = [name for name, value in vars(made_for).items() if value != getattr(these, name)]
         trained, given = (", ".join(f"{n} {getattr(one, n)}" for n in differ) for one in (made_for, these))

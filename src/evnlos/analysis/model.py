@@ -114,6 +114,10 @@ def _in_known_light(
     return best[1:]
 
 
+_KNOW_LATER = ("trace", "likelihood", "corrected")
+_SO_FAR = "no confidence: it is known of images of the whole recording; leave --so-far away"
+
+
 class Model:
     """A trained network with what is known about it; make it with `load_model`.
 
@@ -140,6 +144,7 @@ class Model:
         setup: Setup | None = None,
         pattern: FixedPattern | None = None,
         track: bool = False,
+        so_far: bool = False,
     ) -> Reconstruction:
         """Reconstruct all time steps of a recording.
 
@@ -150,6 +155,8 @@ class Model:
                 confidence asks the `known_setup`, and the images stay.
             pattern: Fixed pattern of the frame camera, to be taken from the frames.
             track: Find the motion in the recording with the setup, also where it is stated.
+            so_far: Whether each image is made of what was seen up to its time step alone (the brightness of
+                the light counts as known); there is no confidence in it then, and no setup moves it.
 
         Raises:
             ConfigError: `track` without a linear setup.
@@ -162,7 +169,11 @@ class Model:
             recording = read_capture(recording, needs_frames=False, needs_events=False)
         capture = recording
         capture.info.check_cameras(capture.name, frames=track or eyes.needs_frames, events=eyes.needs_events)
-        samples = capture_samples(capture, self.weights.sampling, pattern)
+        weights = self.weights
+        if so_far:
+            shown = weights.network.seeing(replace(weights.sampling, surface="so-far"))
+            weights = replace(weights, network=_causal(shown, "leave --so-far away, or take other weights"))
+        samples = capture_samples(capture, weights.sampling, pattern)
         stated, warnings = capture.info.motion, list[str]()
         if stated is not None and (stated.retreat_m_s or stated.spin_deg_s):
             warnings.append(
@@ -177,18 +188,22 @@ class Model:
             warnings += track_warnings(capture, tracked, path)
             samples = replace(samples, position_m=path.at(samples.time_s))
         note("network")
-        images = reconstruct(self.weights, samples.frame, samples.surface, samples.position_m)
-        unjudged = why_no_confidence(self.weights, samples)
+        images = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
+        unjudged = why_no_confidence(weights, samples)
         judge = setup
         if judge is None and unjudged is None:  # an operator takes a second to make
             judge = self.known_setup()
         note("light path")
-        operator = None if judge is None else FrameOperator(judge, self.weights.sampling)
+        operator = None if judge is None else FrameOperator(judge, weights.sampling)
         note("confidence")
         seen, level = samples, None
-        if operator is not None and unjudged is None and "frame" in self.weights.modality.slices:
-            seen, images, level = _in_known_light(self.weights, samples, images, operator)
-        confidence = confidence_of(self.weights, seen, images, operator)
+        if operator is not None and unjudged is None and "frame" in eyes.slices:
+            seen, images, level = _in_known_light(weights, samples, images, operator)
+        if so_far:
+            inputs = eyes.inputs(seen.frame, seen.surface)
+            images = weights.network.infer(inputs, seen.position_m, so_far=True)
+            return Reconstruction(images, samples, None, warnings, None, _SO_FAR, level)
+        confidence = confidence_of(weights, seen, images, operator)
         found = Reconstruction(
             images, samples, confidence, warnings, no_confidence=unjudged, brought_from=level
         )
@@ -312,8 +327,8 @@ def curve_so_far(
     """Score the image at each time step that is made of what was seen up to it, and of nothing later.
 
     Args:
-        weights: Those of a network of whole sequences; where it sees events, they were solved for the target.
-        dataset: Where the samples are; with events of the surface `so-far`, whatever weights learned from.
+        weights: Those of a network of whole sequences.
+        dataset: Where the samples are; where events were solved for the target, of the surface `so-far`.
         split: "train", "validation", "test" or "all".
         progress: Called after each of the objects.
 
@@ -325,26 +340,26 @@ def curve_so_far(
         DataError: As of `curve_over_positions`, or the surfaces of the events know later ones.
     """
     network, samples, sequences = _sequences(weights, dataset, split)
-    if network.modality.needs_events and dataset.sampling.surface != "so-far":
-        raise DataError(
-            f"surfaces of {dataset.sampling.surface!r} are not of the events so far alone; import the captures "
-            "with --sampling.surface so-far"
-        )
-    network.sampling = weights.sampling.corrected_as(dataset.sampling)
+    network = _causal(network.seeing(dataset.sampling), "import the captures with --sampling.surface so-far")
     rows, steps = dataset.sampling.scored, min(map(len, sequences.values()))
     decibel = np.empty((steps, len(sequences)))
     mine_of = counted(sequences.values(), progress, "so far", len(sequences), "sequences")
     for number, mine in enumerate(mine_of):
-        places = torch.from_numpy(samples.position_m[mine].astype(np.float32))
         inputs, truth = (part[torch.from_numpy(mine)].float() for part in (samples.inputs, samples.truth))
-        for step in range(steps):
-            seen, now = slice(0, step + 1), slice(step, step + 1)
-            drawn = network.draw(inputs[seen], places[seen], places[now])
-            decibel[step, number] = psnr(drawn[:, rows].contiguous(), truth[now, rows].contiguous())[0]
+        drawn = network.infer(inputs, samples.position_m[mine], so_far=True)
+        found = psnr(drawn[:, rows].contiguous(), truth[:, rows].contiguous())
+        decibel[:, number] = found[:steps].numpy()
     return [
         PositionsPoint(step + 1, 1, float(row.mean()), dict(zip(sequences, row.tolist(), strict=True)))
         for step, row in enumerate(decibel)
     ]
+
+
+def _causal(network: Reconstructor, cure: str) -> Reconstructor:
+    """Return a reconstructor whose surfaces of events know no later ones; raise a DataError of any other."""
+    if network.modality.needs_events and (surface := network.sampling.surface) in _KNOW_LATER:
+        raise DataError(f"surfaces of {surface!r} know later events, not only those so far; {cure}")
+    return network
 
 
 def _sequences(

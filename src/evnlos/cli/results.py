@@ -53,6 +53,9 @@ class ReconstructCommand:
     track: bool = False
     """Find the motion in the recording, as `evnlos track` does, also where capture.yaml states it; needs
     --setup, and takes about a minute."""
+    so_far: bool = False
+    """Make each image of what was seen up to its position alone: a film of what becomes known as the recording
+    goes on. By default a network of whole sequences makes one image of the whole recording."""
     json: bool = False
     """Print one JSON object."""
 
@@ -69,18 +72,18 @@ class ReconstructCommand:
         from evnlos.setups import lit_setup
 
         setup = lit_setup(self.setup) if self.setup else None
-        known = {"pattern": pattern_of(self.setup, self.pattern), "setup": setup, "track": self.track}
+        how: dict[str, Any] = {"setup": setup, "pattern": pattern_of(self.setup, self.pattern)}
+        how |= {"track": self.track, "so_far": self.so_far}
         with ProgressBars() as progress:
-            found = reconstruct_capture(self.capture, self.weights, self.out, **known, progress=progress)
+            found = reconstruct_capture(self.capture, self.weights, self.out, **how, progress=progress)
         for warning in found.get("warnings", []):
             say(f"warning: {warning}")
         if self.json:
             print(json.dumps(found | {"out": str(self.out)}))
             return
         print(f"{self.out}: {found['positions']} positions of {found['capture']} by {found['weights']}")
-        print(f"{self.out / 'result.png'} shows them once, with what was seen and what to believe")
-        for line in found["in_words"]:
-            print(line)
+        once = f"{self.out / 'result.png'} shows them once, with what was seen and what to believe"
+        print("\n".join([once, *found["in_words"]]))
         if "scores" in found:
             print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
 
@@ -101,8 +104,7 @@ def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool) -> N
     from evnlos.data.lab import render_captures
     from evnlos.report import reconstruct_capture
 
-    out = demo / "first"
-    if out.exists():
+    if (out := demo / "first").exists():
         return
     capture = next(iter(captures_in(captures)), None)
     try:
@@ -354,8 +356,7 @@ class IdentifyCommand:
         whole = "what a whole sequence of frames, of events, of both shows: --bounds (half a minute per setup)"
         print("\n".join(f"\n{limit.table(in_columns=True)}" for limit in limits.values()) or whole)
         if self.out is not None:
-            names = ["identify.json", *(Path(one).name for one in written if one)]
-            print(f"{self.out}: {', '.join(names)}")
+            print(f"{self.out}: identify.json", *(Path(one).name for one in written if one), sep=", ")
 
 
 @dataclass(frozen=True)

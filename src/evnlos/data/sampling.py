@@ -108,8 +108,8 @@ class Sampling:
         """Whether the surface is the target that the events show through the light path of `setup`."""
         return self.surface in ("likelihood", "corrected", "so-far")
 
-    def corrected_as(self, other: Sampling) -> Sampling:
-        """Return it with errors taken from events as another has it, where both show the target so."""
+    def shown_as(self, other: Sampling) -> Sampling:
+        """Return it with the surface of another where both show what events say of the target."""
         return replace(self, surface=other.surface) if self.is_solved and other.is_solved else self
 
     def of_frames(self) -> Sampling:

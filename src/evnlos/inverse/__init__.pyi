@@ -35,6 +35,7 @@ from .operators import Gradient as Gradient
 from .operators import LinearOperator as LinearOperator
 from .operators import LogChange as LogChange
 from .operators import Solution as Solution
+from .operators import left_out_errors as left_out_errors
 from .operators import log_change as log_change
 from .operators import operator_norm as operator_norm
 from .operators import ridge_by_groups as ridge_by_groups

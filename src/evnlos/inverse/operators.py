@@ -368,3 +368,32 @@ def ridge_by_groups(
         better = left.square().sum(dim=0) < missed.square().sum(dim=0)
         best, missed = torch.where(better, dual, best), torch.where(better, left, missed)
     return known.T @ best.to(known), missed
+
+
+def left_out_errors(
+    gram: torch.Tensor,
+    outer: torch.Tensor,
+    left_gram: torch.Tensor,
+    left_outer: torch.Tensor,
+    penalties: Sequence[float],
+) -> torch.Tensor:
+    """Return the squared error on samples left out, less their sum |Y|^2, for each ridge, float64.
+
+    In the eigenvectors of the other samples' Gram matrix each ridge is a diagonal, and ||C W - Y||^2 needs no
+    more than matrices of the code's size.
+
+    Args:
+        gram: C^T C of the other samples, float64 [R, R].
+        outer: Their C^T Y, float64 [R, H W].
+        left_gram: C^T C of those left out.
+        left_outer: Their C^T Y.
+        penalties: The ridges, in units of the mean power of a component.
+    """
+    powers, turn = torch.linalg.eigh(gram)
+    powers = powers.clamp_min(0)
+    turned = turn.T @ outer  # [R, H W]
+    aimed = (turned * (turn.T @ left_outer)).sum(dim=1)
+    square = (turn.T @ left_gram @ turn) * (turned @ turned.T)
+    ridges = torch.tensor(penalties, dtype=torch.float64) * powers.mean().clamp_min(1e-30)
+    inverse = 1 / (powers + ridges[:, None])  # [ridges, R]
+    return ((inverse @ square) * inverse).sum(dim=1) - 2 * inverse @ aimed

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.operators import left_out_errors
 from evnlos.registry import Kinded, Registry
 from evnlos.types import derive_seed
 
@@ -131,6 +133,8 @@ class Reconstructor(nn.Module, ABC):
         position_m: NDArray | None = None,
         names: NDArray | None = None,
         batch_size: int = 40,
+        *,
+        so_far: bool = False,
     ) -> Tensor:
         """Return images of samples; the module goes over to evaluation mode.
 
@@ -140,6 +144,8 @@ class Reconstructor(nn.Module, ABC):
                 reconstructor of sequences needs it.
             names: Object of each sample, [N]; None: all are of one.
             batch_size: Samples at a time.
+            so_far: Whether each image is made of an object's samples up to its own, in their order, and of no
+                later one; those of single time steps always are.
 
         Returns:
             Images on the canvas, float32 [N, H, W], 0..1.
@@ -160,9 +166,21 @@ class Reconstructor(nn.Module, ABC):
         images = inputs.new_zeros((len(inputs), *inputs.shape[-2:]), dtype=torch.float32)
         for owner in range(int(owners.max()) + 1):
             mine = torch.from_numpy(np.flatnonzero(owners == owner)).to(inputs.device)
-            at = places[mine.cpu()]
-            images[mine] = self.draw(inputs[mine], at, at)
+            seen, at = inputs[mine], places[mine.cpu()]
+            now = range(1, len(at) + 1)
+            each = [self.draw(seen[:n], at[:n], at[n - 1 : n]) for n in now] if so_far else []
+            images[mine] = torch.cat(each) if so_far else self.draw(seen, at, at)
         return images
+
+    def seeing(self, sampling: Sampling) -> Reconstructor:
+        """Return this reconstructor, weights shared, for samples that show what events say as others do.
+
+        Args:
+            sampling: How the others were made, see `Sampling.shown_as`.
+        """
+        same = copy(self)
+        same.sampling = self.sampling.shown_as(sampling)
+        return same
 
     def freeze(self, parts: tuple[str, ...]) -> None:
         """Keep the weights of some parts, by their names in `parts`, as they are.
@@ -360,32 +378,10 @@ def _regress(code: Tensor, y: Tensor, folds: Tensor) -> tuple[Tensor, Tensor, Te
         part = code[own]
         parts.append(((part.T @ part).double(), (part.T @ y[own]).double()))
     gram, outer = (torch.stack(column).sum(dim=0) for column in zip(*parts, strict=True))
-    errors = sum(left_out_errors(gram - own, outer - aim, own, aim) for own, aim in parts)
+    errors = sum(left_out_errors(gram - own, outer - aim, own, aim, RIDGES) for own, aim in parts)
     regularization = RIDGES[int(torch.as_tensor(errors).argmin())]
     weights = outer.float() / (powers + regularization * powers.mean().clamp_min(_TINY))[:, None]
     return turn, powers, weights, regularization
-
-
-def left_out_errors(gram: Tensor, outer: Tensor, left_gram: Tensor, left_outer: Tensor) -> Tensor:
-    """Return the squared error on samples left out, less their sum |Y|^2, for each ridge, float64.
-
-    In the eigenvectors of the other samples' Gram matrix each ridge is a diagonal, and ||C W - Y||^2 needs no
-    more than matrices of the code's size.
-
-    Args:
-        gram: C^T C of the other samples, float64 [R, R].
-        outer: Their C^T Y, float64 [R, H W].
-        left_gram: C^T C of those left out.
-        left_outer: Their C^T Y.
-    """
-    powers, turn = torch.linalg.eigh(gram)
-    powers = powers.clamp_min(0)
-    turned = turn.T @ outer  # [R, H W]
-    aimed = (turned * (turn.T @ left_outer)).sum(dim=1)
-    square = (turn.T @ left_gram @ turn) * (turned @ turned.T)
-    ridges = torch.tensor(RIDGES, dtype=torch.float64) * powers.mean().clamp_min(_TINY)
-    inverse = 1 / (powers + ridges[:, None])  # [ridges, R]
-    return ((inverse @ square) * inverse).sum(dim=1) - 2 * inverse @ aimed
 
 
 def _main_directions(x: Tensor, rank: int, seed: int) -> Tensor:

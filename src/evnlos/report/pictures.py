@@ -185,6 +185,7 @@ def reconstruct_capture(
     pattern: FixedPattern | None = None,
     setup: Setup | None = None,
     track: bool = False,
+    so_far: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Reconstruct all positions of a capture and write them as images.
@@ -206,6 +207,7 @@ def reconstruct_capture(
             these are as bright as it makes them. Without one, the setup of the weights explains them, if known.
         track: Find the motion in the recording with the setup, also where it is stated; the truth, where it is
             known, stays where the capture states it.
+        so_far: Whether each image is made of what was seen up to its position alone.
         progress: Called at each of three stages, and at the end.
 
     Returns:
@@ -218,10 +220,8 @@ def reconstruct_capture(
 
     Raises:
         ConfigError: `track` without a setup.
-        DataError: The capture or the weights can't be used, the object can't be tracked, or `out` holds other
-            files.
+        DataError: The capture or weights can't be used, the target can't be tracked, or `out` is not empty.
     """
-    out = Path(out)
     if track:
         setup_for_track(setup)  # before anything is read
     what = f"reconstruct {Path(capture).name}"
@@ -233,11 +233,11 @@ def reconstruct_capture(
         weights = published_for(distance_m, kind, is_motion_known=track or recording.motion is not None)
     model = load_model(weights)
     sampling = model.weights.sampling
-    check_folder(out)
+    check_folder(out := Path(out))
     progress(Step(what, 1, 3, "stages", within="reconstruct, compare with the wall"))
-    made = model.reconstruct(recording, setup, pattern, track)
+    made = model.reconstruct(recording, setup, pattern, track, so_far)
     images, samples, confidence = made.images, made.samples, made.confidence
-    pictures, once = [grey(image) for image in images], model.weights.network.sees_sequence
+    pictures, once = [grey(image) for image in images], model.weights.network.sees_sequence and not so_far
     own = slice(len(pictures) // 2, len(pictures) // 2 + 1) if once else slice(None)  # no copies of others
     progress(Step(what, 2, 3, "stages", within="draw, ask what the wall allows"))
     with new_folder(out) as draft:
