@@ -477,16 +477,19 @@ def test_frames_solved_through_the_light_path_show_the_target(solved) -> None:
     assert error < 0.5 * blind
     assert evaluate(weights, dataset, "train").scores.mean()["psnr_db"] > 12
 
-    def change() -> float:
-        """Return what ambient light that was not foreseen changes."""
-        light, brighter = (network.pooled(inputs + more, places)[0] for more in (0.0, 0.01))
+    pattern = 0.005 * torch.randn(inputs.shape[-2:], generator=torch.Generator().manual_seed(0))
+
+    def change(more: float | torch.Tensor) -> float:
+        """Return what ambient light that was not foreseen, or a fixed pattern, changes."""
+        light, brighter = (network.pooled(inputs + part, places)[0] for part in (0.0, more))
         return float((brighter - light).square().mean())
 
-    known = change()
+    known, of_pattern = change(0.01), change(pattern)
     slim = network.reduced(100).pooled(inputs, places)[1]  # by the strong prior, which needs few components
     assert (slim - pooled[1]).square().mean() < 0.02 * blind
     network.load_state_dict(network.state_dict() | {"frames.static": torch.zeros(len(network.frames.static))})
-    assert known < 0.2 * change()
+    assert known < 0.2 * change(0.01)
+    assert of_pattern < 0.8 * change(pattern)  # in eight frames
 
 
 def test_a_network_learns_from_drawn_sequences(solved, tmp_path, monkeypatch) -> None:

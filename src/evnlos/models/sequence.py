@@ -76,8 +76,7 @@ _COEFFICIENTS, _CELLS_ACROSS = 150, 32  # of prior, target
 _FEWEST = 8  # objects to tell gain, offset and noise from
 _FEWEST_CAPTURES, _MOST_FRAMES, _PARTS = 4, 2048, 4  # that correct the light path; parts left out in turn
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
-_RIDGE, _AT_ONCE = 1e-6, 1024  # frames
-_MOST_KNOWN = 64  # sequences that tell errors
+_RIDGE, _AT_ONCE, _MOST_KNOWN = 1e-6, 1024, 64  # at once: frames; known: sequences that tell errors
 _KEPT_ROWS = 3  # of as many motions: a sequence, its first half and its second
 
 
@@ -96,7 +95,7 @@ class PooledFrames(nn.Module):
 
     with A_k the canvas seen from the target plane, m and V mean and patterns of a Gaussian prior over targets,
     `along` the light of what moves with the target (a polynomial of its place), and an offset that is the same
-    in all frames of a sequence: ambient light that was not foreseen. With the offset integrated out, J = A V
+    in all frames of a sequence: unforeseen ambient light, a fixed pattern. With it integrated out, J = A V
     and C what is left, the estimate at a weight w of the prior is
 
         z_w = (sum_k J_k^T C^-1 J_k + w)^-1 sum_k J_k^T C^-1 (c_k - along - A_k m)
@@ -193,7 +192,8 @@ class PooledFrames(nn.Module):
         self.ambient.copy_(ambient)
         light = torch.zeros(kept, *operator.size)
         light[:, rows] = carry.T.unflatten(1, (-1, operator.size[1]))
-        self.take_components(basis, light, along, shifts.T @ shifts / count, white)
+        # The camera's pattern, where nobody removes it, may be as large as the noise of a frame.
+        self.take_components(basis, light, along, shifts.T @ shifts / count + (turn * variance) @ turn.T, white)
         prior = handwritten_prior(self.target_plane, _COEFFICIENTS, ink=setup.ink)
         self.mean.copy_(torch.from_numpy(prior.mean).unflatten(0, self.target_plane.shape))
         self.patterns.copy_(torch.from_numpy(prior.patterns.T.copy()).unflatten(1, self.target_plane.shape))
