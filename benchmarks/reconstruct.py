@@ -29,6 +29,7 @@ import torch
 from evnlos.analysis import reconstruct
 from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.data.sampling import make_samples
+from evnlos.live import StreamingReconstructor
 from evnlos.models import UNetConfig, Weights, load_weights
 from evnlos.scene import LineMotion
 from evnlos.types import Events
