@@ -361,14 +361,16 @@ def generalization(
     operator = FrameOperator(own.setup, sampling) if "frame" in loaded.modality.slices else None
     processes(workers, 1)
     found = list[GeneralizationResult]()
-    for name, config in evaluation_sets(own, sampling, 12).items():
+    sets = evaluation_sets(own, sampling, 12)
+    for done, (name, config) in enumerate(sets.items()):
         key = config_hash(config)[:8]
         folder = out / "simulations" / f"{setup.name}-{name.replace(' ', '-')}-{key}"
         dataset = simulate(config, folder, workers, progress=progress, force=force)
         same = operator is None or config.setup == own.setup
         own_wall = operator if same else FrameOperator(config.setup, sampling)
+        progress(Step("score", done, len(sets), "sets", within=name))
         found.append(_score(name, loaded, dataset, operator, own_wall))
-        progress(Step(f"score {folder.name}", 1, 1, "sets", found[-1]))
+        progress(Step("score", done + 1, len(sets), "sets", found[-1]))
     return found
 
 
