@@ -28,13 +28,7 @@ from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, ca
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, counted, note, silent
 from evnlos.metrics import psnr
-from evnlos.models import (
-    ConfidenceReport,
-    Reconstructor,
-    Weights,
-    load_weights,
-    published_setup,
-)
+from evnlos.models import ConfidenceReport, Reconstructor, Weights, load_weights, published_setup
 from evnlos.setups import Setup, load_setup
 
 _SAME_LIGHT = (0.75, 1.33)
@@ -202,7 +196,7 @@ class Model:
         if so_far:
             inputs = eyes.inputs(seen.frame, seen.surface)
             images = weights.network.infer(inputs, seen.position_m, so_far=True)
-            return Reconstruction(images, samples, None, warnings, None, _SO_FAR, level)
+            return Reconstruction(images, samples, warnings=warnings, no_confidence=_SO_FAR, brought_from=level)
         confidence = confidence_of(weights, seen, images, operator)
         found = Reconstruction(
             images, samples, confidence, warnings, no_confidence=unjudged, brought_from=level

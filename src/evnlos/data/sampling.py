@@ -34,6 +34,8 @@ from evnlos.types import Colour, Events, Plane
 
 _TRACES = {"trace": event_trace, "sae-trace": surface_with_trace}
 _BLOCK_BYTES = 1 << 26  # of frames and surfaces at the sensor's resolution
+SOLVED = ("likelihood", "corrected", "so-far")
+"""Surfaces that are the target which the events show through the light path of a setup."""
 
 
 def frame_homography(
@@ -106,7 +108,7 @@ class Sampling:
     @property
     def is_solved(self) -> bool:
         """Whether the surface is the target that the events show through the light path of `setup`."""
-        return self.surface in ("likelihood", "corrected", "so-far")
+        return self.surface in SOLVED
 
     def shown_as(self, other: Sampling) -> Sampling:
         """Return it with the surface of another where both show what events say of the target."""

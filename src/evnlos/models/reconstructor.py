@@ -167,9 +167,11 @@ class Reconstructor(nn.Module, ABC):
         for owner in range(int(owners.max()) + 1):
             mine = torch.from_numpy(np.flatnonzero(owners == owner)).to(inputs.device)
             seen, at = inputs[mine], places[mine.cpu()]
-            now = range(1, len(at) + 1)
-            each = [self.draw(seen[:n], at[:n], at[n - 1 : n]) for n in now] if so_far else []
-            images[mine] = torch.cat(each) if so_far else self.draw(seen, at, at)
+            if so_far:
+                each = [self.draw(seen[:n], at[:n], at[n - 1 : n]) for n in range(1, len(at) + 1)]
+                images[mine] = torch.cat(each)
+            else:
+                images[mine] = self.draw(seen, at, at)
         return images
 
     def seeing(self, sampling: Sampling) -> Reconstructor:

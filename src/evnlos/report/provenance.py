@@ -19,6 +19,7 @@ import torch
 import yaml
 
 from evnlos.data import Dataset, Sampling
+from evnlos.data.sampling import SOLVED
 from evnlos.errors import printable
 from evnlos.models import GENERIC, Weights, describe_network
 from evnlos.registry import __version__
@@ -250,7 +251,7 @@ def weights_text(name: str, found: dict[str, Any]) -> str:
     """Return the description as lines for people."""
     sees = "whole sequences" if found["sees_sequence"] else "one time step at a time"
     sampling = found["sampling"]
-    is_solved = sampling.get("surface") in ("likelihood", "corrected", "so-far")
+    is_solved = sampling.get("surface") in SOLVED
     through = f", through the light path of {sampling.get('setup') or 'each setup'}" if is_solved else ""
     lines = [
         f"{name}: {found['modality']}, {found['network']['kind']}: {sees}; {found['parameters']:,} trained "

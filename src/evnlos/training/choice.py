@@ -134,7 +134,7 @@ def choose_and_finetune(
             log = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
             return TrainingResult(out, log)
         save_yaml(about, out / "run.yaml")
-        start.network.sampling = start.sampling.shown_as(dataset.sampling)
+        start = replace(start, network=start.network.seeing(dataset.sampling))
         gains = _cross_validated(dataset, candidates, trials, weights, start, progress)
         choice = _choice(gains)
         if choice.candidate is None:

@@ -267,8 +267,8 @@ def _network(settings: Training, start: Weights | None, sampling: Sampling) -> t
         if start is not None:
             network.take_layers(start.network)
         return network, settings
-    start.network.sampling = start.sampling.shown_as(sampling)
-    return start.network, replace(settings, network=start.network.settings, modality=start.modality.name)
+    network = start.network.seeing(sampling)
+    return network, replace(settings, network=network.settings, modality=start.modality.name)
 
 
 def _check_drawn(
