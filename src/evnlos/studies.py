@@ -23,7 +23,7 @@ from evnlos.data.lab import lab_of, render_captures
 from evnlos.data.simulations import paper
 from evnlos.demo import ROBUST, Demo, run_demo
 from evnlos.errors import CalibrationError, DataError, UnknownNameError
-from evnlos.experiment import Record, difference, means_of, read_records
+from evnlos.experiment import Record, gains_over_e2e, means_of, read_records
 from evnlos.experiment.run import Run, train_one
 from evnlos.experiment.study import is_scored, keep_scores, records_there
 from evnlos.machine import Progress, silent
@@ -146,7 +146,7 @@ class Finding:
         left: "frames" or "surfaces" (of events) -> (residual on held-out captures, what noise leaves), shares.
         mean_image_db: Modality -> PSNR of the mean image, dB.
         psnr_db: (arm, modality) -> PSNR of each seed, dB.
-        leads_db: Modality -> what EPNP is ahead of the strongest end-to-end arm, dB.
+        leads_db: Modality -> the strongest end-to-end arm, and what EPNP is ahead of it, dB.
     """
 
     setup: str
@@ -156,12 +156,11 @@ class Finding:
     left: dict[str, tuple[float, float]]
     mean_image_db: dict[str, float]
     psnr_db: dict[tuple[str, str], list[float]]
-    leads_db: dict[str, Interval]
+    leads_db: dict[str, tuple[str, Interval]]
 
     def best_e2e(self, modality: str) -> float:
-        """Return the mean PSNR of the strongest end-to-end arm, dB; NaN where there is none."""
-        name = _strongest(self.psnr_db, modality)
-        return self.of(name, modality) if name else math.nan
+        """Return the mean PSNR of the arm that EPNP is ahead of, dB; NaN where there is none."""
+        return self.of(self.leads_db[modality][0], modality) if modality in self.leads_db else math.nan
 
     def of(self, arm: str, modality: str) -> float:
         """Return the mean PSNR of an arm over its seeds, dB; NaN where it was not run."""
@@ -210,12 +209,6 @@ def run_mismatch(
         found.append(finding(name, outs))
         write_atomically(base.out / "mismatch.md", mismatch_table(found).encode())
     return found
-
-
-def _strongest(psnr_db: dict[tuple[str, str], list[float]], modality: str) -> str | None:
-    """Return the name of the end-to-end arm with the largest mean PSNR; None where there is none."""
-    means = {arm: np.mean(v) for (arm, p), v in psnr_db.items() if arm.startswith("E2E") and p == modality}
-    return max(means, key=means.__getitem__, default=None)
 
 
 def mismatch_setups(asked: tuple[str, ...] = (), captures: Path | None = None) -> tuple[str, ...]:
@@ -267,11 +260,7 @@ def finding(setup: str, outs: list[Path]) -> Finding:
     warnings = dict.fromkeys(line for one in figures for line in one["warnings"])
     words = refused[0].read_text() if refused else ""
     expected = next((str(one["expectation"]) for one in figures if one.get("expectation")), "")
-    psnr_db, leads = means_of(records), dict[str, Interval]()
-    for modality in mean_image:
-        other = _strongest(psnr_db, modality)
-        if other is not None and ("EPNP", modality) in psnr_db:
-            leads[modality] = difference(records, "EPNP", other, modality)
+    psnr_db, leads = means_of(records), gains_over_e2e(records)
     return Finding(setup, words, tuple(warnings), expected, left, mean_image, psnr_db, leads)
 
 
@@ -302,7 +291,7 @@ def mismatch_table(found: list[Finding]) -> str:
             three = (one.best_e2e(modality), *(one.of(arm, modality) for arm in ("simulation only", "EPNP")))
             numbers = (one.mean_image_db[modality], *three)
             cells = [one.setup, modality, left, *(f"{v:.2f}" for v in numbers)]
-            cells.append(str(one.leads_db.get(modality, "")))
+            cells.append(str(one.leads_db[modality][1]) if modality in one.leads_db else "")
             cells += [f"{one.of(arm, modality):.2f}" for arm in drawn]
             lines.append(f"| {' | '.join(cells)} |")
         if one.refused:
@@ -314,7 +303,7 @@ def _margins(found: list[Finding]) -> list[str]:
     """Return a line for each modality: by how much EPNP leads, in the mean and where it leads least."""
     lines = []
     for modality in STANDARD_MODALITIES:
-        lead = {one.setup: one.leads_db[modality].mean for one in found if modality in one.leads_db}
+        lead = {one.setup: one.leads_db[modality][1].mean for one in found if modality in one.leads_db}
         above = {
             one.setup: one.of("simulation only", modality) - one.mean_image_db[modality]
             for one in found
@@ -361,7 +350,7 @@ def leads_of(found: list[Finding]) -> Leads:
             *(lead.mean, lead.low, lead.high),
         )
         for one in found
-        for modality, lead in one.leads_db.items()
+        for modality, (_, lead) in one.leads_db.items()
     }
 
 

@@ -26,6 +26,7 @@ from .table import character_table as character_table
 from .table import checks_table as checks_table
 from .table import difference as difference
 from .table import gain_table as gain_table
+from .table import gains_over_e2e as gains_over_e2e
 from .table import generalization_table as generalization_table
 from .table import means_of as means_of
 from .table import retrieved as retrieved

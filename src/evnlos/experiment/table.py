@@ -83,12 +83,8 @@ def score_arm(
     there, new = records_there(folder), list[Record]()
     samples = NlosDataset(recorded, study.split, modality)
     means = NlosDataset(recorded, "train", modality).truth.float().mean(dim=0)
-    refined = (
-        study.refine
-        and study.correct_pattern
-        and "frame" in as_modality(modality).slices
-        and arm.source == "calibrated"
-    )
+    refined = study.refine and study.correct_pattern and arm.source == "calibrated"
+    refined = refined and "frame" in as_modality(modality).slices
 
     def record(name: str, seed: int, settings: dict[str, Any]) -> Record:
         return Record(study.name, study.setup, name, modality, seed, study.split, {}, {}, {}, {}, settings)
@@ -266,9 +262,7 @@ def summary_table(records: list[Record], metric: str = "psnr_db") -> str:
             values = [
                 r.baselines[name][metric] for r in records if r.modality == modality and name in r.baselines
             ]
-            cells.append(
-                f"{np.mean([np.mean(list(v.values())) for v in values[-1:]]):.{digits}f}" if values else ""
-            )
+            cells.append(f"{np.mean(list(values[-1].values())):.{digits}f}" if values else "")
         lines.append(f"| {title} | {' | '.join(cells)} |")
     for arm in dict.fromkeys(key[0] for key in means):
         cells = [_cell(means.get((arm, modality)), digits) for modality in modalities]
@@ -282,10 +276,8 @@ def character_table(records: list[Record], arms: tuple[str, ...], metric: str = 
     seen = sorted({r.modality for r in chosen}, key=modality_order)
     columns = [(a, p) for a in arms for p in seen if any(r.arm == a and r.modality == p for r in chosen)]
     digits = _PLACES.get(metric, 3)
-    lines = [
-        f"| {metric} | {' | '.join(f'{arm} {modality}' for arm, modality in columns)} |",
-        "|---|" + "---|" * len(columns),
-    ]
+    head = " | ".join(f"{arm} {modality}" for arm, modality in columns)
+    lines = [f"| {metric} | {head} |", "|---|" + "---|" * len(columns)]
     for name in dict.fromkeys(name for record in chosen for name in record.scores[metric]):
         values = [
             np.mean([r.scores[metric][name] for r in chosen if (r.arm, r.modality) == column])
@@ -297,22 +289,32 @@ def character_table(records: list[Record], arms: tuple[str, ...], metric: str = 
     return "\n".join(lines)
 
 
-def gain_table(records: list[Record], arm: str = "EPNP") -> str:
-    """Return Markdown: what an arm gains over the strongest of end-to-end ones, dB, with a 95 % interval.
+def gains_over_e2e(records: list[Record], arm: str = "EPNP") -> dict[str, tuple[str, Interval]]:
+    """Return modality -> the strongest of end-to-end arms, and what an arm gains over it, dB.
 
     Args:
         records: Records of a study.
         arm: Name of the arm.
     """
-    means = means_of([r for r in records if r.seed >= 0])
-    modalities = sorted({r.modality for r in records if r.arm == arm}, key=modality_order)
-    lines = [f"| {arm} - strongest E2E | which | dB, 95 % interval |", "|---|---|---|"]
-    for modality in modalities:
+    means, found = means_of([r for r in records if r.seed >= 0]), dict[str, tuple[str, Interval]]()
+    for modality in sorted({r.modality for r in records if r.arm == arm}, key=modality_order):
         others = [name for name, seen in means if seen == modality and name.startswith("E2E")]
         if others:
             best = max(others, key=lambda name: float(np.mean(means[name, modality])))
-            lines.append(f"| {modality} | {best} | {difference(records, arm, best, modality)} |")
-    return "\n".join(lines)
+            found[modality] = best, difference(records, arm, best, modality)
+    return found
+
+
+def gain_table(records: list[Record], arm: str = "EPNP") -> str:
+    """Return Markdown: `gains_over_e2e`, with 95 % intervals.
+
+    Args:
+        records: Records of a study.
+        arm: Name of the arm.
+    """
+    lines = [f"| {arm} - strongest E2E | which | dB, 95 % interval |", "|---|---|---|"]
+    found = gains_over_e2e(records, arm)
+    return "\n".join([*lines, *(f"| {seen} | {best} | {gain} |" for seen, (best, gain) in found.items())])
 
 
 def checks_table(records: list[Record]) -> str:
@@ -388,11 +390,8 @@ def _order(sequences: list[ConfidenceCheck]) -> str:
     support, skill = (np.array([getattr(one, key) for one in sequences]) for key in ("support", "skill"))
     risk = 1 - skill
     parts = []
-    for order, name in (
-        (support, "by support"),
-        (skill, "by skill itself"),
-        (np.zeros(len(risk)), "as they come"),
-    ):
+    orders = {"by support": support, "by skill itself": skill, "as they come": np.zeros(len(risk))}
+    for name, order in orders.items():
         shares, kept = risk_coverage(order, risk)
         at = [float(kept[np.searchsorted(shares, share)]) for share in (0.25, 0.5, 0.75, 1.0)]
         parts.append(f"{name} " + " / ".join(f"{1 - value:.2f}" for value in at))
