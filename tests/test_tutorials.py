@@ -36,6 +36,7 @@ LESS_WORK: tuple[tuple[str, str], ...] = (
     (r"--network\.rank 512", "--network.rank 32"),
     (r"--pitch 0\.008", "--pitch 0.02"),
     (r"--hold-s 0\.3", "--hold-s 0.2"),
+    (r"(scan import .*)", r"\1 --height 45 --width 80"),
 )
 """Expressions over a command and what takes their place: fewer letters, frames, pixels, cells, writers and
 epochs. One calibration of three also fits the event pixel; `test_calibration.py` has all of its fits."""
