@@ -1,5 +1,6 @@
 """Scenes of the demo: their commands exist, run in their folder, go on, and end in a page."""
 
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -49,6 +50,15 @@ def test_a_scene_states_commands_that_are_there_and_pictures_that_they_make(name
         stem = Path(file).stem.rpartition("_")[0] or Path(file).stem
         assert stem in written or file.split("/")[0] in written or file == "corner/result.png"
     assert all(file in written for file in scene.files)
+
+
+def test_the_gallery_shows_what_each_scene_finds():
+    """A picture of each, and the name of the scene's file that it is, in the order of the table."""
+    page = (Path(__file__).resolve().parent.parent / "docs" / "gallery.md").read_text(encoding="utf-8")
+    parts = dict(re.findall(r"^### (\w+)\n(!\[[^]]+\]\(figures/[^)]+\)\n\n.*)$", page, flags=re.MULTILINE))
+    assert [name.lower() for name in parts] == re.findall(r"^\| `(\w+)` \|", page, flags=re.MULTILINE) == NAMES
+    for title, part in parts.items():
+        assert re.findall(r"^`([^`]+)`", part, flags=re.MULTILINE)[0] in scene_of(title.lower()).pictures
 
 
 def test_a_scene_runs_goes_on_and_shows_what_its_commands_said(tmp_path, monkeypatch, capfd):
