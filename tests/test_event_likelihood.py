@@ -33,6 +33,7 @@ from evnlos.inverse import (
     gains_by_errors,
     handwritten_prior,
     record_of,
+    root_of,
     sequence_light,
 )
 from evnlos.metrics import psnr
@@ -403,13 +404,14 @@ def test_what_samples_and_weights_must_share(tmp_path: Path) -> None:
 
 def errors_of(draw: np.random.Generator, captures: int, drift: float) -> tuple[EventErrors, np.ndarray]:
     """Return errors of captures about information A [12, 12]: noise, and along two axes what is no noise."""
-    root = draw.normal(size=(12, 12)) + 4 * np.eye(12)
-    scores = draw.normal(size=(captures, 12)) @ root.T
+    half = draw.normal(size=(12, 12)) + 4 * np.eye(12)
+    root = root_of(half @ half.T)
+    scores = draw.normal(size=(captures, 12)) @ root
     scores[:, 0] += 20 * drift
     scores[:, 1] += 20 * drift * draw.normal(size=captures)
     about = AboutErrors(tuple(f"c{k}" for k in range(captures)))
-    a = root @ root.T
-    return EventErrors(about, torch.tensor(scores).float(), torch.tensor(a).float()), a
+    roots, light = torch.tensor(root).float().repeat(captures, 1, 1), torch.full((captures,), 0.1)
+    return EventErrors(about, torch.tensor(scores @ np.linalg.inv(root)).float(), roots, light), root @ root
 
 
 @pytest.mark.parametrize("drift", [0.0, 1.0])
@@ -419,12 +421,13 @@ def test_what_captures_show_of_errors_helps_the_next(drift: float) -> None:
         draw = np.random.default_rng(seed)
         errors, a = errors_of(draw, 15, drift)
         z = draw.normal(size=12)
-        score = a @ z + errors.scores[3].double().numpy()  # the fourth is the next: it does not count itself
+        score = (
+            a @ z + root_of(a) @ errors.errors[3].double().numpy()
+        )  # the fourth is the next: it does not count itself
         statistic = EventStatistic(z, a, score)
         without = EventErrors(
             AboutErrors(errors.about.captures[:3] + errors.about.captures[4:]),
-            errors.scores[[k for k in range(15) if k != 3]],
-            errors.information,
+            *(part[[k for k in range(15) if k != 3]] for part in (errors.errors, errors.roots, errors.light)),
         )
         found = errors.corrected(statistic, "c3")
         np.testing.assert_allclose(found.score, without.corrected(statistic, "new").score, rtol=1e-6, atol=1e-9)
@@ -440,7 +443,7 @@ def test_few_captures_change_nothing_of_what_events_say() -> None:
     assert errors.corrected(statistic, "c2") is statistic
     assert errors.corrected(statistic, "another") is not statistic
     with pytest.raises(DataError, match="of 2 captures"):
-        EventErrors(AboutErrors(("a", "b")), errors.scores, errors.information)
+        EventErrors(AboutErrors(("a", "b")), errors.errors, errors.roots, errors.light)
 
 
 @pytest.mark.parametrize("drift", [0.0, 1.0])
@@ -451,7 +454,7 @@ def test_the_gain_of_errors_is_that_of_captures_left_out(drift: float) -> None:
         draw = np.random.default_rng(seed)
         errors, a = errors_of(draw, 15, drift)
         hidden = draw.normal(size=(15, 12))
-        scores = hidden @ a + errors.scores.double().numpy()
+        scores = hidden @ a + errors.errors.double().numpy() @ root_of(a)
         statistics = [EventStatistic(z, a, score) for z, score in zip(hidden, scores, strict=True)]
         gains.append(errors.gain_db(statistics, prior, [prior.image(z) for z in hidden]))
     assert np.mean(gains) > 1.0 if drift else abs(np.mean(gains)) < 0.25
@@ -482,7 +485,7 @@ def test_a_setup_keeps_the_errors_that_captures_show(tiny_captures: list[Path], 
     )
     assert errors is not None and errors.about.gain_db > 1.5 and file.is_file()
     assert errors.about.captures == tuple(folder.name for folder in both) and gains_by_errors(tmp_path)
-    assert said[0] == "0 of 8" and said[-1] == "8 of 8" and torch.isfinite(errors.scores).all()
+    assert said[0] == "0 of 8" and said[-1] == "8 of 8" and torch.isfinite(errors.errors).all()
     after = capture_samples(another, sampling).surface
     assert np.abs(after - before).max() > 0.01
     # By its own name it does not count, and others correct it otherwise.

@@ -285,8 +285,9 @@ def test_a_fine_tuning_learns_from_the_events_that_its_start_draws_best(apart) -
     setup, shown = apart.out / "setups" / "lab", replace(SAMPLING, surface="likelihood")
     names, draw = tuple(f"other_{k}" for k in range(5)), torch.Generator().manual_seed(0)
     errors = {
-        "scores": 1e4 * (1 + torch.rand(5, 240, generator=draw)),  # far from any that the sensor has
-        "information": torch.eye(240),
+        "errors": 1e4 * (1 + torch.rand(5, 240, generator=draw)),  # far from any that the sensor has
+        "roots": torch.eye(240).repeat(5, 1, 1),
+        "light": torch.full((5,), 0.1),
     }
     EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, errors, AboutErrors(names, 1.0))
     pre = replace(SMALL, network=SequenceConfig(width=4, depth=1, rank=8, ridge_multipliers=(1.0,)))

@@ -26,6 +26,7 @@ from evnlos.inverse import (
     SequenceOperator,
     event_prior,
     ridge_by_groups,
+    root_of,
 )
 from evnlos.live import StreamingReconstructor
 from evnlos.machine import Step
@@ -378,23 +379,30 @@ def test_known_sequences_of_other_lengths_and_ways_tell_errors_too() -> None:
 def test_errors_of_scores_are_told_from_noise_and_drawn_again() -> None:
     """Mean, scatter and noise of many known targets come back; noise alone shows neither mean nor scatter."""
     draw = np.random.default_rng(0)
-    half = draw.normal(size=(30, 60))
-    information = half @ half.T
-    root = np.linalg.cholesky(information + np.eye(30))
-    mean, spread = root @ draw.normal(size=30), root @ draw.normal(size=(30, 2))
-    noise = draw.normal(size=(400, 30)) @ root.T
+    mean, spread, noise = draw.normal(size=30), draw.normal(size=(30, 2)), draw.normal(size=(400, 30))
     known = mean + draw.normal(size=(400, 2)) @ spread.T + 0.5 * noise
     for given in (0.25, None):
-        errors = ScoreErrors.of(known, information, given)
+        errors = ScoreErrors.of(known, given)
         again = errors.draw(4000, torch.Generator().manual_seed(1)).numpy()
-        expected = spread @ spread.T + 0.25 * (information + np.eye(30))
+        expected = spread @ spread.T + 0.25 * np.eye(30)
         assert np.abs(again.mean(axis=0) - mean).max() < 0.2 * np.abs(mean).max()
         assert np.abs(np.cov(again.T) - expected).max() < 0.15 * np.abs(expected).max()
-    alone = ScoreErrors.of(noise[:12], information, 1.0)
+    alone = ScoreErrors.of(noise[:12], 1.0)
     assert np.abs(alone.mean).max() < 0.1 * np.abs(mean).max()
     assert np.square(alone.spread).sum() < 0.2 * np.square(spread).sum()
-    few = ScoreErrors.of(noise[:1], information, 0.25)
-    assert few.spread.shape == (30, 0) and not few.mean.any() and np.allclose(few.noise, 0.5 * root)
+    few = ScoreErrors.of(noise[:1], 0.25)
+    assert few.spread.shape == (30, 0) and not few.mean.any() and few.noise == 0.25
+
+
+def test_what_says_nothing_of_the_target_has_no_noise() -> None:
+    """The root of information is its own square root, symmetric, and nothing where it is nothing."""
+    draw = np.random.default_rng(0)
+    half = draw.normal(size=(2, 12, 7))
+    information = half @ half.swapaxes(1, 2)  # five of twelve directions unseen
+    roots = root_of(information)
+    np.testing.assert_allclose(roots @ roots, information, atol=1e-6)
+    np.testing.assert_allclose(roots, roots.swapaxes(1, 2), atol=1e-12)
+    assert (np.linalg.eigvalsh(roots)[:, :5] < 1e-3).all()
 
 
 def test_motions_in_turn_are_solved_as_each_alone() -> None:
@@ -543,7 +551,8 @@ def test_events_of_drawn_targets_show_them(solved, tmp_path) -> None:
     prior, grid = event_prior(setup, 0.08), network().grid
     file, about = tmp_path / EVENT_ERRORS_FILE, AboutErrors(tuple("ABCDE"))
     for count in (120, prior.count):
-        known = {"scores": torch.zeros(5, count), "information": 1e10 * torch.eye(count)}
+        roots = 1e5 * torch.eye(count).repeat(5, 1, 1)
+        known = {"errors": torch.zeros(5, count), "roots": roots, "light": torch.full((5,), 0.1)}
         EVENT_ERRORS.write(file, known, about)
         if count < prior.count:  # of an older calibration
             sampling = Sampling(surface="likelihood", setup=str(tmp_path))
@@ -564,6 +573,28 @@ def test_events_of_drawn_targets_show_them(solved, tmp_path) -> None:
             assert (image - expected).square().mean() < 0.02 * expected.var()
     with pytest.raises(DataError, match=r"has no events\.safetensors"):
         DrawnEvents(Sampling(setup=str(tmp_path / "none")), grid, torch.abs, at)
+
+
+def test_a_bright_target_is_drawn_with_what_events_say_of_bright_ones(solved, tmp_path) -> None:
+    """Here the events of four dim captures say all, those of four bright ones nothing."""
+    dataset, _ = solved
+    setup = load_setup(dataset.sampling.setup)
+    save_yaml(to_dict(setup), tmp_path / "setup.yaml")
+    prior, grid, at = event_prior(setup, 0.08), network().grid, torch.zeros(1, 2)
+    roots = torch.tensor([1e5, 1e-4]).repeat_interleave(4)[:, None, None] * torch.eye(prior.count)
+    light = torch.tensor([0.1, 0.9]).repeat_interleave(4)
+    known = {"errors": torch.zeros(8, prior.count), "roots": roots, "light": light}
+    EVENT_ERRORS.write(tmp_path / EVENT_ERRORS_FILE, known, AboutErrors(tuple("ABCDEFGH")))
+    events = DrawnEvents(Sampling(surface="likelihood", setup=str(tmp_path)), grid, torch.clone, at)
+    target = torch.from_numpy(
+        FontGlyphs(characters="F").target("comic_neue_bold_F").rasterise(prior.target_plane)
+    )
+    planes = grid.of_target(torch.stack([target.float(), 1 - target.float()]), 0.08)
+    dim, bright = events(planes, torch.Generator().manual_seed(0))
+    unseen = torch.from_numpy(np.clip(prior.image(np.zeros(prior.count)), 0, 1)).float()
+    blank = grid.of_target(unseen[None], 0.08)[0]
+    assert (dim - planes[0]).square().mean() < 0.1 * planes[0].var()
+    assert (bright - blank).square().mean() < 0.02 * blank.var() < (dim - blank).square().mean()
 
 
 def test_frames_are_not_solved_without_a_setup(tiny_dataset, tmp_path) -> None:

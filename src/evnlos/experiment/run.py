@@ -350,7 +350,7 @@ def _planned(
         runs.append(Run((made,), settings, out, begin, captures=recorded[0] if settings.drawn else None))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
-        settings = replace(arm.last_training(modality), modality=modality, seed=seed)
+        settings = replace(arm.finetuning, modality=modality, seed=seed)
         start = runs[-1].out if runs else begin
         names = " ".join(one.folder.name for one in recorded)
         decides = {"data": names, "settings": to_dict(settings), "from": start and Path(start).name}

@@ -15,7 +15,7 @@ import numpy as np
 from evnlos.analysis import Evaluation, Scores
 from evnlos.calibration import Calibration
 from evnlos.config import to_dict
-from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation, as_modality
+from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, Step
@@ -96,12 +96,6 @@ class Arm:
         """Return the settings of the pre-training of the network that sees a modality."""
         assert self.pretraining is not None
         return self.pretraining if self.anew is None or self.layers(modality) else self.anew
-
-    def last_training(self, modality: str) -> Training:
-        """Return the settings of the fine-tuning of the network that sees a modality."""
-        assert self.finetuning is not None
-        # Captures alone tell more of events than with sequences drawn beside them.
-        return replace(self.finetuning, drawn=self.finetuning.drawn * as_modality(modality).needs_frames)
 
     @property
     def held_out(self) -> float:

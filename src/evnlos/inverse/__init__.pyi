@@ -44,6 +44,7 @@ from .prior import PatternPrior as PatternPrior
 from .prior import ScoreErrors as ScoreErrors
 from .prior import best_bent as best_bent
 from .prior import handwritten_prior as handwritten_prior
+from .prior import root_of as root_of
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
 from .problem import SeveralSequences as SeveralSequences

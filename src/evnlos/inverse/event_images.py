@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from evnlos.errors import ConfigError, DataError, UnknownNameError
-from evnlos.inverse.prior import PatternPrior, ScoreErrors, handwritten_prior
+from evnlos.inverse.prior import PatternPrior, ScoreErrors, handwritten_prior, root_of
 from evnlos.inverse.sequence_light import EVENT_PRIORS, sequence_light
 from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
 from evnlos.machine import note
@@ -63,23 +63,30 @@ class AboutErrors:
 class EventErrors:
     """What captures with known targets showed that a setup gets wrong of its events.
 
+    How much events say depends on the target: the information is that of the logarithm of the light, and a
+    bright target leaves less of it, a tenth between the least and the most of 28 letters and digits. So each
+    capture keeps its own, and errors are in units of its root.
+
     Args:
         about: Names of the captures, and what they gained.
-        scores: Score of each about its true target, b - A z*, float32 [C, k].
-        information: Mean A of them, float32 [k, k].
+        errors: R^-1 (b - A z*) of the score b of each about its true target z*, float32 [C, k].
+        roots: R, root of the information A of each (`root_of`), float32 [C, k, k].
+        light: Mean light of each target, 0..1, float32 [C].
 
     Raises:
         DataError: The sizes disagree.
     """
 
     about: AboutErrors
-    scores: torch.Tensor
-    information: torch.Tensor
+    errors: torch.Tensor
+    roots: torch.Tensor
+    light: torch.Tensor
 
     def __post_init__(self) -> None:
-        count = self.information.shape[-1]
-        if self.scores.shape != (len(self.about.captures), count) or self.information.ndim != 2:
-            raise DataError(f"scores {list(self.scores.shape)} of {len(self.about.captures)} captures")
+        captures, count = len(self.about.captures), self.roots.shape[-1]
+        shapes = self.errors.shape, self.roots.shape, self.light.shape
+        if shapes != ((captures, count), (captures, count, count), (captures,)):
+            raise DataError(f"errors {list(self.errors.shape)} of {captures} captures")
 
     @classmethod
     def of(
@@ -97,18 +104,19 @@ class EventErrors:
             prior: What they are about.
             truths: True target of each, on the cells of the prior, [h, w].
         """
-        missed = [
-            one.score - one.information @ prior.coefficients(true)
-            for one, true in zip(statistics, truths, strict=True)
+        roots = [root_of(one.information) for one in statistics]
+        errors = [
+            np.linalg.solve(root, one.score - one.information @ prior.coefficients(true))
+            for root, one, true in zip(roots, statistics, truths, strict=True)
         ]
-        information = np.mean([one.information for one in statistics], axis=0)
-        tensors = (torch.from_numpy(part).float() for part in (np.stack(missed), information))
+        light = np.array([true.mean() for true in truths])
+        tensors = (torch.from_numpy(part).float() for part in (np.stack(errors), np.stack(roots), light))
         return cls(AboutErrors(tuple(names)), *tensors)
 
     def write(self, setup: Path, gain_db: float = 0.0) -> EventErrors:
         """Write them to the folder of a setup, with what captures gain by them, and return them with that."""
         found = replace(self, about=replace(self.about, gain_db=gain_db))
-        tensors = {"scores": self.scores, "information": self.information}
+        tensors = {"errors": self.errors, "roots": self.roots, "light": self.light}
         EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, found.about)
         return found
 
@@ -119,11 +127,8 @@ class EventErrors:
             statistic: What they say if the setup is right.
             capture: Name of their capture, which does not count; fewer than 4 others change nothing.
         """
-        others = self.scores.double().numpy()[[name != capture for name in self.about.captures]]
-        if len(others) < _FEWEST:
-            return statistic
-        errors = ScoreErrors.of(others, self.information.double().numpy(), 1.0)
-        return with_errors(statistic, errors)
+        others = self.errors.double().numpy()[[name != capture for name in self.about.captures]]
+        return statistic if len(others) < _FEWEST else with_errors(statistic, ScoreErrors.of(others, 1.0))
 
     def gain_db(
         self, statistics: Sequence[EventStatistic], prior: PatternPrior, truths: Sequence[NDArray[np.floating]]
@@ -153,15 +158,16 @@ def with_errors(statistic: EventStatistic, errors: ScoreErrors) -> EventStatisti
         statistic: What they say if the setup is right.
         errors: What the setup gets wrong of scores.
     """
-    a, count = statistic.information, len(statistic.information)
-    noise = a + errors.spread @ errors.spread.T + _LEAST * np.trace(a) / count * np.eye(count)
+    a, root = statistic.information, root_of(statistic.information)
+    spread = root @ errors.spread
+    noise = a + spread @ spread.T + _LEAST * np.trace(a) / len(a) * np.eye(len(a))
     pushed = np.linalg.solve(noise, a).T  # A N^-1
-    return EventStatistic(statistic.z, pushed @ a, pushed @ (statistic.score - errors.mean))
+    return EventStatistic(statistic.z, pushed @ a, pushed @ (statistic.score - root @ errors.mean))
 
 
 EVENT_ERRORS = TensorFile(
-    "evnlos-event-errors-1",
-    ("scores", "information"),
+    "evnlos-event-errors-2",
+    ("errors", "roots", "light"),
     AboutErrors,
     EventErrors,
     "errors of a setup's events",
@@ -187,9 +193,9 @@ def event_errors(setup: str | Path, instead: str) -> EventErrors:
             f"again, or {instead}"
         )
     found = EVENT_ERRORS.load(path, "")
-    if len(found.information) != COEFFICIENTS:
+    if found.roots.shape[-1] != COEFFICIENTS:
         raise DataError(
-            f"{path} is about {len(found.information)} patterns of the target, and events are solved for "
+            f"{path} is about {found.roots.shape[-1]} patterns of the target, and events are solved for "
             f"{COEFFICIENTS}; calibrate again, or {instead}"
         )
     return found

@@ -250,41 +250,48 @@ def handwritten_prior(
     return PatternPrior(target_plane, mean.numpy(), patterns[:, :coefficients].contiguous().numpy(), rest)
 
 
+_NULL = 1e-10  # of the largest eigenvalue: less is what rounding leaves
+
+
+def root_of(information: Array) -> Array:
+    """Return R with R R = A, symmetric, of information A [..., k, k]: noise of b = A z* is R e."""
+    values, axes = np.linalg.eigh(information)
+    roots = np.sqrt(np.maximum(values, _NULL * values[..., -1:]))
+    return (axes * roots[..., None, :]) @ np.swapaxes(axes, -1, -2)
+
+
 @dataclass(frozen=True, eq=False)
 class ScoreErrors:
-    """What a setup gets wrong of scores b = A z*, learned from known targets z*: b - A z* = m + S e + N e'.
+    """What a setup gets wrong of scores b = A z*, learned from known targets z*: b - A z* = R (m + S e + n e').
 
-    e and e' are independent and of variance 1; S is what targets scatter by more than noise.
+    R is the root of A (`root_of`), so that what says little of the target errs little. e and e' are independent
+    and of variance 1; S is what targets scatter by more than noise.
 
     Args:
         mean: m, what all share, float64 [k].
         spread: S, float64 [k, C].
-        noise: N, float64 [k, k].
+        noise: n^2, variance of the noise where A counts it as 1.
     """
 
     mean: Array
     spread: Array
-    noise: Array
+    noise: float
 
     @classmethod
-    def of(cls, scores: Array, information: Array, noise: float | None = None) -> ScoreErrors:
+    def of(cls, errors: Array, noise: float | None = None) -> ScoreErrors:
         """Return what known targets show; fewer than 2 show nothing but noise.
 
-        In units of the root of A + 1, of mean and scatter what noise alone would leave is no error (James and
-        Stein).
+        Of mean and scatter what noise alone would leave is no error (James and Stein).
 
         Args:
-            scores: b - A z* of each, [C, k].
-            information: A, [k, k].
-            noise: Variance of the noise where A counts it as 1; None: what the least of the scatter shows
-                (Marchenko and Pastur), as where A counts errors of the light path as noise.
+            errors: R^-1 (b - A z*) of each, [C, k].
+            noise: Variance of the noise; None: what the least of the scatter shows (Marchenko and Pastur), as
+                where A counts errors of the light path as noise.
         """
-        number, count = scores.shape
-        root = np.asarray(np.linalg.cholesky(information + np.eye(count)), np.float64)
+        number, count = errors.shape
         if number < 2:
-            alone = root if noise is None else root * math.sqrt(noise)
-            return cls(np.zeros(count), np.zeros((count, 0)), alone)
-        seen = np.linalg.solve(root, scores.T)
+            return cls(np.zeros(count), np.zeros((count, 0)), 1.0 if noise is None else noise)
+        seen = errors.T
         mean = seen.mean(axis=1)
         rest = seen - mean[:, None]
         total = float(np.square(rest).sum()) / (number - 1)
@@ -295,15 +302,14 @@ class ScoreErrors:
             noise = float(min(max(least, 0.0) / max(1.0 - math.sqrt(share), 0.1) ** 2, total / count))
         mean *= max(0.0, 1.0 - total / number / max(float(mean @ mean), 1e-12))
         rest *= np.sqrt(max(0.0, 1.0 - count * noise / max(total, 1e-12)) / (number - 1))
-        return cls(root @ mean, root @ rest, root * math.sqrt(noise))
+        return cls(mean, rest, noise)
 
     def draw(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        """Return errors of so many new targets, float64 [count, k]."""
-        drawn = torch.from_numpy(self.mean).expand(count, -1)
-        for part in (self.spread, self.noise):
-            own = torch.randn(count, part.shape[1], generator=generator, dtype=torch.float64)
-            drawn = drawn + own @ torch.from_numpy(part).T
-        return drawn
+        """Return errors R^-1 (b - A z*) of so many new targets, float64 [count, k]."""
+        shape = (count, len(self.mean))
+        own = torch.randn(count, self.spread.shape[1], generator=generator, dtype=torch.float64)
+        noise = math.sqrt(self.noise) * torch.randn(shape, generator=generator, dtype=torch.float64)
+        return torch.from_numpy(self.mean) + own @ torch.from_numpy(self.spread).T + noise
 
 
 @torch.no_grad()

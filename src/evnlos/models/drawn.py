@@ -26,7 +26,7 @@ from evnlos.data import Sampling, Simulation
 from evnlos.data.pool import run_in_order
 from evnlos.errors import ConfigError
 from evnlos.inverse.event_images import event_errors, event_prior, with_errors
-from evnlos.inverse.prior import ScoreErrors
+from evnlos.inverse.prior import ScoreErrors, root_of
 from evnlos.inverse.sequence_light import EVENT_PRIORS
 from evnlos.inverse.sequence_statistic import EventStatistic
 from evnlos.machine import Progress, counted, silent
@@ -127,6 +127,7 @@ DRAWN_FILE = "drawn.safetensors"
 _POPULATIONS = 4  # of writers: what is bent anew is not as good as new, and more take long to draw
 _SIDE, _AT_ONCE, _COUNT = 64, 32, 8  # pixels of one; drawn at a time; subsets of the time steps
 _TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.08, 0.07, 0.05, 0.12, 0.016, 0.03
+_ALIKE = 4  # captures nearest in light
 _WAVES = 5  # knots along a side of the field that bends
 
 
@@ -298,23 +299,27 @@ class DrawnFrames:
             one.solver.errors(one.frames[:steps], one.truth[:steps], way, self.kept)
             for one, way in zip(alike, ways, strict=True)
         ]
-        scores = torch.stack(missed, dim=1).numpy()  # [K, C, k]
-        self._errors = [
-            ScoreErrors.of(mine, own.numpy()) for mine, own in zip(scores, self._information, strict=True)
-        ]
+        # In units of A + 1: those of A do not scatter where nothing is seen, and nothing more is learned.
+        roots = root_of(self._information.numpy() + np.eye(self._information.shape[-1]))
+        units = np.linalg.solve(roots, torch.stack(missed, dim=2).numpy())  # [K, k, C]
+        self._errors = [ScoreErrors.of(mine.T) for mine in units]
+        self._roots = torch.from_numpy(roots)
 
     def __call__(self, planes: Tensor, generator: torch.Generator) -> Tensor:
         """Return the solved images of planes [B, P, P], [B, S, P, P]: of all time steps, or of some."""
         some = torch.rand((), generator=generator) < 0.5
         k = int(torch.randint(len(self.kept), (), generator=generator)) if some else 0
         cells = F.avg_pool2d(planes[:, None], FINER).flatten(1)
-        score = (cells @ self._seen[k].T).double() + self._base[k] + self._errors[k].draw(len(cells), generator)
+        missed = self._errors[k].draw(len(cells), generator) @ self._roots[k]
+        score = (cells @ self._seen[k].T).double() + self._base[k] + missed
         found = self._solver.solved(self._information[k], score)
         return self._grid.of_target(found, self._solver.target_plane.extent_m[0])
 
 
 class DrawnEvents:
     """What the events of newly drawn targets say, solved: b = A z + what captures show that is missed.
+
+    A is that of one of the four captures whose targets are nearest in light.
 
     Args:
         sampling: Names the setup, and says whether its errors are taken from events (`corrected`).
@@ -332,14 +337,16 @@ class DrawnEvents:
         known = event_errors(_folder(sampling.setup), "leave --drawn at 0")
         self._prior = event_prior(load_setup(sampling.setup), target_side_m(sampling.canvas))
         self._grid, self._scale = grid, scale
-        a = known.information.double().numpy()
-        errors = ScoreErrors.of(known.scores.double().numpy(), a, 1.0)
-        told = EventStatistic(np.zeros(len(a)), a, np.eye(len(a)))  # of each score alone: solving is linear
+        self._errors = errors = ScoreErrors.of(known.errors.double().numpy(), 1.0)
+        self._roots, self._log_light = known.roots.double(), known.light.log()
+        told = [
+            EventStatistic(np.zeros(len(a)), a, np.eye(len(a))) for a in (self._roots @ self._roots).numpy()
+        ]
         if sampling.surface == "corrected":  # which has lost what all share
-            errors = replace(errors, mean=np.zeros(len(a)))
-            told = with_errors(told, errors)
-        self._errors, self._information = errors, torch.from_numpy(a)
-        self._back = torch.from_numpy(told.solutions(EVENT_PRIORS))  # [n, k, k]
+            self._errors = replace(errors, mean=np.zeros_like(errors.mean))
+            told = [with_errors(one, self._errors) for one in told]
+        back = [one.solutions(EVENT_PRIORS) for one in told]  # of each score alone: solving is linear
+        self._back = torch.from_numpy(np.stack(back))  # [C, n, k, k]
         spot = torch.zeros(grid.side, grid.side)
         spot[grid.side // 2, grid.side // 2] = 1
         spread = grid.mean(grid.on_canvas(spot, position_m), position_m)  # by the pixels of the canvas
@@ -351,12 +358,20 @@ class DrawnEvents:
         prior, size_m = self._prior, self._prior.target_plane.extent_m[0]
         inner = self._grid.target_of(planes, size_m, prior.target_plane.height)
         z = torch.from_numpy(prior.coefficients(inner.double().numpy()))
-        score = z @ self._information + self._errors.draw(len(z), generator)
-        found = torch.einsum("nkl,bl->bnk", self._back, score)
+        like = self._like(inner, generator)
+        roots, errors = self._roots[like], self._errors.draw(len(z), generator)
+        score = torch.einsum("bkl,bl->bk", roots, torch.einsum("bkl,bl->bk", roots, z) + errors)
+        found = torch.einsum("bnkl,bl->bnk", self._back[like], score)
         images = torch.from_numpy(prior.image(found.numpy())).clamp(0, 1)
         seen = self._grid.of_target(images.float(), size_m)
-        blurred = F.conv2d(seen.flatten(0, 1)[:, None], self._blur, padding="same").view_as(seen)
-        return self._scale(blurred)
+        return self._scale(F.conv2d(seen.flatten(0, 1)[:, None], self._blur, padding="same").view_as(seen))
+
+    def _like(self, targets: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the capture whose information targets [B, h, h] have: one of those as bright as they are."""
+        apart = (targets.flatten(1).mean(dim=1).clamp_min(1e-6).log()[:, None] - self._log_light).abs()
+        few = apart.argsort(dim=1)[:, :_ALIKE]
+        chosen = torch.randint(few.shape[1], (len(few), 1), generator=generator)
+        return few.gather(1, chosen)[:, 0]
 
 
 class DrawnSequences:
