@@ -254,7 +254,12 @@ _NULL = 1e-10  # of the largest eigenvalue: less is what rounding leaves
 
 
 def root_of(information: Array) -> Array:
-    """Return R with R R = A, symmetric, of information A [..., k, k]: noise of b = A z* is R e."""
+    """Return the symmetric root R of information A, R R = A, [..., k, k]: the noise of a score b = A z* is R e.
+
+    Args:
+        information: A, [..., k, k], symmetric; what of it is rounding, 1e-10 of the largest eigenvalue, is kept
+            above 0.
+    """
     values, axes = np.linalg.eigh(information)
     roots = np.sqrt(np.maximum(values, _NULL * values[..., -1:]))
     return (axes * roots[..., None, :]) @ np.swapaxes(axes, -1, -2)
