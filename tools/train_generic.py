@@ -168,7 +168,8 @@ def solve(number: int, out: Path) -> Path | None:
         edges_us = np.append(0, np.round(1e6 * samples.time_s)).astype(np.int64)
         said.append(event_statistic(events, edges_us, plan.motion, sampling.setup, side_m)[0])
     truths = [plan.glyphs.target(name, glyph_seed).rasterise(prior.target_plane) for name in names]
-    EventErrors.of(names, said, prior, truths).write(folder)
+    some = slice(None, None, 3)  # a dozen tell as much, and each keeps two matrices
+    EventErrors.of(names[some], said[some], prior, truths[some]).write(folder)
     grid = TargetGrid(sampling)
     parts = {
         "frame": DrawnFrames(solver, known, grid),

@@ -170,7 +170,9 @@ class TensorFile(Generic[Content]):
         is_ours = isinstance(found, dict) and found.get("format") == self.format
         if not is_ours or not tensors.keys() >= set(self.names):
             stated = found.get("format", "no format") if isinstance(found, dict) else found
-            raise DataError(f"{path} holds {str(stated)[:40]!r}; give {self.thing} of format {self.format}")
+            raise DataError(
+                f"{path} holds {str(stated)[:40]!r}; give {self.thing} of format {self.format}, {self.origin}"
+            )
         try:
             about = from_dict(self.about, found.get("about", {}), source=str(path))
             return self.build(about=about, **{name: tensors[name] for name in self.names})

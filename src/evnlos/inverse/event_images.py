@@ -63,9 +63,9 @@ class AboutErrors:
 class EventErrors:
     """What captures with known targets showed that a setup gets wrong of its events.
 
-    How much events say depends on the target: the information is that of the logarithm of the light, and a
-    bright target leaves less of it, a tenth between the least and the most of 28 letters and digits. So each
-    capture keeps its own, and errors are in units of its root.
+    How much events say depends on the target: a pixel sees the logarithm of the light, which changes less where
+    a bright target shines; among 28 letters and digits the information differs 14-fold. So each capture keeps
+    its own, and errors are in units of its root.
 
     Args:
         about: Names of the captures, and what they gained.

@@ -250,18 +250,18 @@ def handwritten_prior(
     return PatternPrior(target_plane, mean.numpy(), patterns[:, :coefficients].contiguous().numpy(), rest)
 
 
-_NULL = 1e-10  # of the largest eigenvalue: less is what rounding leaves
+_NULL = 1e-10  # of the largest eigenvalue
 
 
 def root_of(information: Array) -> Array:
     """Return the symmetric root R of information A, R R = A, [..., k, k]: the noise of a score b = A z* is R e.
 
     Args:
-        information: A, [..., k, k], symmetric; what of it is rounding, 1e-10 of the largest eigenvalue, is kept
-            above 0.
+        information: A, [..., k, k], symmetric. What is below 1e-10 of its largest eigenvalue, or of the prior's
+            own 1, is rounding, and counts as that much.
     """
     values, axes = np.linalg.eigh(information)
-    roots = np.sqrt(np.maximum(values, _NULL * values[..., -1:]))
+    roots = np.sqrt(np.maximum(values, _NULL * np.maximum(values[..., -1:], 1.0)))
     return (axes * roots[..., None, :]) @ np.swapaxes(axes, -1, -2)
 
 
