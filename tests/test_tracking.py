@@ -613,6 +613,26 @@ def test_no_line_of_the_speed_lies_on_the_frame(tmp_path, monkeypatch) -> None:
     assert low == 0 and high > 1.05 * 2.0
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_a_track_has_a_panel_for_each_course_that_was_found(several, tmp_path, monkeypatch) -> None:
+    """No empty one for the size of several objects; distance and turn side by side."""
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    times, ones = np.linspace(0, 8, 9), np.ones(9)
+    path = np.stack([0.02 * times, np.zeros(9)], axis=1)
+    track = Track(times, path, path * 0, path, path, "m", times, path, path, ones * np.nan, ones * np.nan, 0)
+    if not several:
+        turn = Turn(times, 3 * times, ones, ones, ones)
+        track = replace(track, distance=Distance(times, 0.3 + 0 * times, 0.01 * ones, ones, ones), turn=turn)
+    draw_track(track, tmp_path / "t.png")
+    titles = [axes.get_title() for axes in drawn[0].axes if axes.axison]
+    more = [] if several else ["distance from the wall", "turn about its mean"]
+    assert titles == ["path", "position", "speed", *more]
+
+
 def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, capsys, monkeypatch) -> None:
     """Motion found gives an image near that of motion stated, and the confidence that goes with it."""
     folder, setup = capture

@@ -196,7 +196,7 @@ _HEADROOM = 1.1  # of the speed's axis over the largest speed, so that no line l
 def draw_track(
     track: Track, path: str | Path, truth: NDArray[np.float64] | None = None, title: str = ""
 ) -> Path:
-    """Draw the path, both coordinates, speed, and size or distance over time, with bands of two deviations.
+    """Draw path, coordinates, speed, and distance, turn or size over time, with bands of two deviations.
 
     Args:
         track: The track.
@@ -211,10 +211,17 @@ def draw_track(
         MissingDependencyError: matplotlib is not installed.
     """
     scale, unit = (100.0, "cm") if track.unit == "m" else (1.0, "px")
-    figure = new_figure((11.0, 6.4))
-    (plane, along), (speed, size) = figure.subplots(2, 2)
-    if title:
-        figure.suptitle(title)
+    curves: list[tuple[Any, Any, Any, str, str]] = []
+    if (away := track.distance) is not None:
+        seen = scale * away.distance_m, scale * away.distance_sigma
+        curves.append((away.time_s, *seen, f"distance, {unit}", "distance from the wall"))
+    if (turn := track.turn) is not None:
+        curves.append((turn.time_s, turn.rotation_deg, turn.rotation_sigma, "degrees", "turn about its mean"))
+    if not curves and np.isfinite(track.size).any():
+        curves.append((track.frame_time_s, track.size, track.size_sigma, "over its mean", "size of the image"))
+    figure = new_figure((16.5 if len(curves) > 1 else 11.0, 6.4))
+    plane, along, speed, *rest = figure.subplots(2, 2 + len(curves) // 2).flat
+    figure.suptitle(title)
     plane.plot(*(scale * track.frame_position.T), ".", color="0.6", label="frames")
     plane.plot(*(scale * track.position.T), color="C0", label="track")
     if truth is not None:
@@ -223,40 +230,32 @@ def draw_track(
     plane.invert_yaxis()
     plane.set_aspect("equal", adjustable="datalim")
     plane.legend()
-    for axis, name in enumerate("xy"):
-        middle, band = scale * track.position[:, axis], 2 * scale * track.position_sigma[:, axis]
-        along.plot(track.time_s, middle, color=f"C{axis}", label=name)
-        along.fill_between(track.time_s, middle - band, middle + band, color=f"C{axis}", alpha=0.3)
-        if truth is not None:
-            along.plot(track.time_s, scale * truth[:, axis], "--", color="k", linewidth=1)
+    for axis, (middle, sigma) in enumerate(zip(track.position.T, track.position_sigma.T, strict=True)):
+        _band(along, track.time_s, scale * middle, scale * sigma, f"C{axis}", "xy"[axis])
+    if truth is not None:
+        along.plot(track.time_s, scale * truth, "--", color="k", linewidth=1)
     along.set(xlabel="time, s", ylabel=f"position, {unit}", title="position")
     along.legend()
-    middle, band = scale * track.speed, 2 * scale * track.speed_sigma
-    top = float((middle + band).max())
-    speed.plot(track.time_s, middle, color="C2")
-    speed.fill_between(track.time_s, middle - band, middle + band, color="C2", alpha=0.3)
+    top = _band(speed, track.time_s, scale * track.speed, scale * track.speed_sigma, "C2")
     if truth is not None:
-        rate = np.gradient(truth, track.time_s, axis=0)
-        true = scale * np.hypot(rate[:, 0], rate[:, 1])
+        true = scale * np.linalg.norm(np.gradient(truth, track.time_s, axis=0), axis=1)
         top = max(top, float(true.max()))
         speed.plot(track.time_s, true, "--", color="k", linewidth=1)
     # An upper end of None would stay where it stood before and cut a band that has just been drawn.
     speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, _HEADROOM * top or None))
-    if track.distance is None and track.turn is not None:
-        middle, band = track.turn.rotation_deg, 2 * track.turn.rotation_sigma
-        size.plot(track.turn.time_s, middle, color="C3")
-        size.fill_between(track.turn.time_s, middle - band, middle + band, color="C3", alpha=0.3)
-        size.set(xlabel="time, s", ylabel="turn, degrees", title="turn about its mean")
-    elif track.distance is None:
-        size.errorbar(track.frame_time_s, track.size, 2 * track.size_sigma, fmt=".", color="C3")
-        size.set(xlabel="time, s", ylabel="size over its mean", title="size of the image")
-    else:
-        away = track.distance
-        middle, band = scale * away.distance_m, 2 * scale * away.distance_sigma
-        size.plot(away.time_s, middle, color="C3")
-        size.fill_between(away.time_s, middle - band, middle + band, color="C3", alpha=0.3)
-        size.set(xlabel="time, s", ylabel=f"distance, {unit}", title="distance from the wall")
+    for axes, (time_s, middle, sigma, name, heading) in zip(rest, curves, strict=False):
+        _band(axes, time_s, middle, sigma, "C3")
+        axes.set(xlabel="time, s", ylabel=name, title=heading)
+    for axes in rest[len(curves) :]:
+        axes.set_axis_off()
     return save_figure(figure, path, dpi=80)
+
+
+def _band(axes: Any, time_s: Any, middle: Any, sigma: Any, color: str, label: str | None = None) -> float:
+    """Draw a course with a band of two deviations, and return its upper end."""
+    axes.plot(time_s, middle, color=color, label=label)
+    axes.fill_between(time_s, middle - 2 * sigma, top := middle + 2 * sigma, color=color, alpha=0.3)
+    return float(top.max())
 
 
 _LEAST_SKILL = -1.2  # worse sequences are drawn on this line
