@@ -171,7 +171,7 @@ EVENT_ERRORS = TensorFile(
     AboutErrors,
     EventErrors,
     "errors of a setup's events",
-    "the file that `evnlos calibrate` wrote beside setup.yaml",
+    "the file that `evnlos calibrate` of this version writes beside setup.yaml",
 )
 """Errors of events on disk."""
 
