@@ -20,7 +20,7 @@ from evnlos.data import (
     read_shard,
     reduce_by_area,
 )
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from watching import Watch, stopped
 
 
@@ -97,6 +97,12 @@ def test_held_out_names_must_exist_and_not_overlap(tiny_captures, tmp_path) -> N
         import_captures(tiny_captures, tmp_path / "d", test=["Z"])
     with pytest.raises(EvnlosError, match="choose one"):
         import_captures(tiny_captures, tmp_path / "d", test=["A"], validation=["lab_A"])
+    assert not (tmp_path / "d").exists()
+
+
+def test_events_are_not_solved_without_a_setup(tiny_captures, tmp_path) -> None:
+    with pytest.raises(ConfigError):
+        import_captures(tiny_captures, tmp_path / "d", Sampling(surface="likelihood"))
     assert not (tmp_path / "d").exists()
 
 

@@ -330,10 +330,15 @@ def import_captures(
         The dataset.
 
     Raises:
+        ConfigError: The surface is solved through a setup, and none is named.
         DataError: No folder, two captures of one name, or a held-out name that no capture has.
     """
     paths = by_name([Path(folder).resolve() for folder in folders])
     split = split_of(list(paths), list(test), list(validation))
+    if sampling.is_solved:
+        from evnlos.inverse.event_images import check_named  # which compiles
+
+        check_named(sampling.setup)
     # Read every description first: a wrong folder is an error before anything is written.
     for path in paths.values():
         if not path.exists():

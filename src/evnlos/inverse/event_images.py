@@ -235,14 +235,26 @@ def event_statistic(
         return found.solver(found.events), found.prior
 
 
-def _sequence(
-    events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str, side_m: float
-) -> _Sequence:
+def check_named(setup: str) -> None:
+    """Refuse to solve events where no setup is named.
+
+    Args:
+        setup: Word of the setup, empty where none is.
+
+    Raises:
+        ConfigError: It is empty.
+    """
     if not setup:
         raise ConfigError(
             "Sampling.setup is empty; the surfaces 'likelihood' and 'so-far' undo the light path of a setup: "
             "give the folder of `evnlos calibrate`"
         )
+
+
+def _sequence(
+    events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str, side_m: float
+) -> _Sequence:
+    check_named(setup)
     if motion is None:
         raise DataError(
             "the motion is unknown, and the surfaces 'likelihood' and 'so-far' need it; state it in "
