@@ -421,9 +421,8 @@ def test_what_captures_show_of_errors_helps_the_next(drift: float) -> None:
         draw = np.random.default_rng(seed)
         errors, a = errors_of(draw, 15, drift)
         z = draw.normal(size=12)
-        score = (
-            a @ z + root_of(a) @ errors.errors[3].double().numpy()
-        )  # the fourth is the next: it does not count itself
+        own = root_of(a) @ errors.errors[3].double().numpy()  # the fourth is the next: it does not count itself
+        score = a @ z + own
         statistic = EventStatistic(z, a, score)
         without = EventErrors(
             AboutErrors(errors.about.captures[:3] + errors.about.captures[4:]),

@@ -299,7 +299,7 @@ class DrawnFrames:
             one.solver.errors(one.frames[:steps], one.truth[:steps], way, self.kept)
             for one, way in zip(alike, ways, strict=True)
         ]
-        # In units of A + 1: those of A do not scatter where nothing is seen, and nothing more is learned.
+        # Of A + 1, so that what is not seen scatters too; with the root of A alone networks learn no more.
         roots = root_of(self._information.numpy() + np.eye(self._information.shape[-1]))
         units = np.linalg.solve(roots, torch.stack(missed, dim=2).numpy())  # [K, k, C]
         self._errors = [ScoreErrors.of(mine.T) for mine in units]
@@ -337,16 +337,14 @@ class DrawnEvents:
         known = event_errors(_folder(sampling.setup), "leave --drawn at 0")
         self._prior = event_prior(load_setup(sampling.setup), target_side_m(sampling.canvas))
         self._grid, self._scale = grid, scale
-        self._errors = errors = ScoreErrors.of(known.errors.double().numpy(), 1.0)
+        self._errors = ScoreErrors.of(known.errors.double().numpy(), 1.0)
         self._roots, self._log_light = known.roots.double(), known.light.log()
-        told = [
-            EventStatistic(np.zeros(len(a)), a, np.eye(len(a))) for a in (self._roots @ self._roots).numpy()
-        ]
+        # Solving is linear: the columns of a root are the scores b that R^-1 b is made of.
+        told = [EventStatistic(np.zeros(len(root)), root @ root, root) for root in self._roots.numpy()]
         if sampling.surface == "corrected":  # which has lost what all share
-            self._errors = replace(errors, mean=np.zeros_like(errors.mean))
+            self._errors = replace(self._errors, mean=np.zeros_like(self._errors.mean))
             told = [with_errors(one, self._errors) for one in told]
-        back = [one.solutions(EVENT_PRIORS) for one in told]  # of each score alone: solving is linear
-        self._back = torch.from_numpy(np.stack(back))  # [C, n, k, k]
+        self._back = torch.from_numpy(np.stack([one.solutions(EVENT_PRIORS) for one in told]))  # [C, n, k, k]
         spot = torch.zeros(grid.side, grid.side)
         spot[grid.side // 2, grid.side // 2] = 1
         spread = grid.mean(grid.on_canvas(spot, position_m), position_m)  # by the pixels of the canvas
@@ -359,8 +357,9 @@ class DrawnEvents:
         inner = self._grid.target_of(planes, size_m, prior.target_plane.height)
         z = torch.from_numpy(prior.coefficients(inner.double().numpy()))
         like = self._like(inner, generator)
-        roots, errors = self._roots[like], self._errors.draw(len(z), generator)
-        score = torch.einsum("bkl,bl->bk", roots, torch.einsum("bkl,bl->bk", roots, z) + errors)
+        score = torch.einsum("bkl,bl->bk", self._roots[like], z) + self._errors.draw(
+            len(z), generator
+        )  # R^-1 b
         found = torch.einsum("bnkl,bl->bnk", self._back[like], score)
         images = torch.from_numpy(prior.image(found.numpy())).clamp(0, 1)
         seen = self._grid.of_target(images.float(), size_m)
