@@ -82,6 +82,8 @@ def test_the_leads_are_drawn_as_the_table_has_them(tmp_path):
     assert [label.get_text() for label in left.get_yticklabels()] == ["one", "two"]
     drawn = sorted(float(line.get_xdata()[0]) for line in right.lines if line.get_marker() == "o")
     assert drawn == pytest.approx([-0.5, 2.0, 2.0])
+    alone = lead_figure({("one", "event"): leads["one", "frame"]}).axes[0].get_legend()  # no frames
+    assert [text.get_text() for text in alone.get_texts()] == ["E2E", "simulation only", "EPNP"]
     with pytest.raises(DataError, match="no setup has both"):
         lead_figure({})
 

@@ -371,12 +371,12 @@ def lead_figure(leads: Leads) -> Any:
     left, right = figure.subplots(1, 2, sharey=True)
     for (setup, modality), (e2e, simulated, epnp, lead, low, high) in leads.items():
         y = -setups.index(setup) - 0.25 * (list(_COLOURS).index(modality) - 1)
-        colour, is_first = _COLOURS[modality], setup == setups[0]
+        colour, is_first = _COLOURS[modality], (setup, modality) == next(iter(leads))
         left.plot([e2e, epnp], [y, y], "-", color=colour, alpha=0.3, lw=1.5)
         for value, mark, name in ((e2e, "|", "E2E"), (simulated, ".", "simulation only"), (epnp, "o", "EPNP")):
-            label = name if is_first and modality == "frame" else None
+            label = name if is_first else None
             left.plot(value, y, mark, color=colour, ms=9 if mark == "|" else 5, label=label)
-        bar, label = [[lead - low], [high - lead]], modality if is_first else None
+        bar, label = [[lead - low], [high - lead]], modality if setup == setups[0] else None
         right.errorbar(lead, y, xerr=bar, fmt="o", color=colour, ms=4, capsize=2, lw=1, label=label)
     right.axvline(0, color="#888888", ls="--", lw=1)
     left.set_yticks([-float(number) for number in range(len(setups))], setups)
