@@ -218,9 +218,44 @@ def test_a_fitted_wall_survives_its_file(tmp_path):
     wall = fitted()
     write_fitted(tmp_path / "wall.safetensors", wall)
     back = WALL.read(tmp_path / "wall.safetensors")
-    for name in ("log_density", "sensitivity", "ambient", "companion", "left", "right"):
+    for name in ("log_density", "sensitivity", "ambient", "companion", "left", "right", "tilt"):
         np.testing.assert_array_equal(getattr(back, name), getattr(wall, name))
     assert back.about == wall.about
+
+
+def test_a_tilt_turns_the_wall(tmp_path):
+    """The same slopes everywhere are a wall that is turned; a file of before has none."""
+    turned = np.full((2, 3, 4), 0.0, np.float32)
+    turned[0], turned[1] = 0.02, -0.01
+    flat, tilted = fitted(0), replace(fitted(0), tilt=turned)
+    source = Plane(4, 12, 0.02)
+    one, other = (setup_of(tmp_path / f"{k}.safetensors", wall) for k, wall in enumerate((flat, tilted)))
+    made, changed = (setup.matrix(SHAPE, source).numpy() for setup in (one, other))
+    rows, columns = (v.ravel().astype(float) for v in np.meshgrid(*map(np.arange, SHAPE), indexing="ij"))
+    seen = seen_points(one.pose(), SHAPE, columns, rows)
+    normal = np.array([-0.02, 0.01, 1.0])
+    normals = np.tile(normal / np.linalg.norm(normal), (len(rows), 1))
+    first = np.cross(np.array([0.0, 1.0, 0.0]), normals)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    frames = np.stack([first, np.cross(normals, first), normals], axis=1)
+    eyes = np.einsum("pij,pj->pi", frames, np.einsum("pji,pj->pi", seen.frames.reshape(-1, 3, 3), seen.eyes))
+    expected = np.empty_like(made)
+    fill_facets(
+        expected,
+        Seen(seen.points, np.ascontiguousarray(frames.reshape(-1, 9)), eyes),
+        target_cells(one.pose(), source),
+        one.table(),
+        MASKING,
+    )
+    expected *= flat.image("sensitivity", SHAPE).flatten().double().numpy()[:, None]
+    np.testing.assert_allclose(changed, expected, rtol=1e-6)
+    assert np.abs(changed - made).max() > 0.01 * made.max()
+    tensors = {name: torch.from_numpy(getattr(flat, name)) for name in WALL.names}
+    replace(WALL, later=()).write(tmp_path / "old.safetensors", tensors, flat.about)
+    old = replace(one, file=str(tmp_path / "old.safetensors"), checksum="")
+    np.testing.assert_array_equal(old.matrix(SHAPE, source), made)
+    with pytest.raises(DataError, match="tilt is"):
+        replace(flat, tilt=np.zeros((3, 4), np.float32))
 
 
 def test_damaged_files_and_arrays_that_do_not_fit_are_refused(tmp_path):

@@ -13,7 +13,7 @@ from evnlos.cli.datasets import SimulateCommand
 from evnlos.config import from_dict, to_dict
 from evnlos.data import Simulation
 from evnlos.errors import ConfigError
-from evnlos.lab import Lobe, Mount, Reflection, Torch
+from evnlos.lab import Lobe, Mount, Reflection, Torch, tilted, waves
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import ROOMS, RadiometricSetup, RoomSetup, SensorSize, Setup, load_setup
 from evnlos.types import Plane
@@ -38,6 +38,7 @@ def scene() -> Scene:
         {"curvature": (0.9, 0.5), "texture_smooth": 0.05, "texture_fine": 0.05, "vignetting": 0.1},
         {"lamp": Torch(), "distortion": (-0.05, 0.01), "camera_roll_deg": 2.0, "camera_elevation_deg": 4.0},
         {"aperture_m": 0.012, "focus_m": 0.5, "ambient_gradient": (0.0, 0.0)},
+        {"waviness": 0.005, "curvature": (0.4, 0.0)},
     ],
 )
 def test_the_wall_at_a_key_frame_is_what_the_operator_says(changes):
@@ -74,6 +75,28 @@ def test_texture_and_vignetting_act_on_all_light_alike():
     # the scale by the brightest pixel is the only other difference
     ratio = shaped.throughput((10, 16), plane) / bare.throughput((10, 16), plane)
     np.testing.assert_allclose(ratio, np.broadcast_to(share.numpy().reshape(-1, 1), ratio.shape), rtol=1e-4)
+
+
+def test_waves_are_slopes_of_one_surface_and_turn_what_the_wall_mirrors():
+    """No curl, the stated deviation; and a wall of one slope everywhere is another renderer's turned wall."""
+    x, y = np.meshgrid(np.linspace(0, 0.8, 801), np.linspace(0, 0.5, 501))
+    slopes = waves(x, y, 3, 0.004)
+    across, down = np.gradient(slopes[..., 0], 1e-3, axis=0), np.gradient(slopes[..., 1], 1e-3, axis=1)
+    inside = np.s_[2:-2, 2:-2]
+    assert np.abs(across - down)[inside].max() < 0.05 * np.abs(across).max()
+    assert np.sqrt((slopes**2).mean()) == pytest.approx(0.004, rel=0.15)
+    setup = room(rays=1, curvature=(0.0, 0.0))
+    rays = setup.cast_rays((6, 9))
+    turned = tilted(rays, np.broadcast_to([0.03, -0.02], (54, 1, 2)))
+    normal = np.array([-0.03, 0.02, 1.0]) / np.linalg.norm([0.03, 0.02, 1.0])
+    np.testing.assert_allclose(turned.frame[:, 0, 2], np.broadcast_to(normal, (54, 3)), atol=1e-12)
+    np.testing.assert_allclose(
+        turned.frame @ turned.frame.swapaxes(-1, -2), np.broadcast_to(np.eye(3), (54, 1, 3, 3)), atol=1e-12
+    )
+    seen, same = (np.einsum("psij,psi->psj", one.frame, one.eye) for one in (rays, turned))
+    np.testing.assert_allclose(seen, same, atol=1e-12)
+    flat = tilted(rays, np.zeros((54, 1, 2)))
+    np.testing.assert_allclose(flat.frame, rays.frame, atol=1e-12)
 
 
 def test_both_renderers_agree_where_both_can_describe_the_wall():

@@ -11,7 +11,7 @@ import pytest
 from evnlos.calibration import Calibration, CaptureSet, fit_setup, steps_table
 from evnlos.calibration.captures import grouped, wall_data
 from evnlos.calibration.wall_fit import FREEDOMS, Unknowns, WallState, normal_equations, start_at
-from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
+from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity, uneven_wall
 from evnlos.calibration.wall_search import fit_wall, travelled
 from evnlos.data import Capture, CaptureInfo
 from evnlos.data.capture_info import CameraInfo, MotionInfo, TargetInfo
@@ -281,6 +281,33 @@ def test_texture_and_operator_errors_are_told_from_noise(rendered):
     before = ((own.shared_removed(wrong - light)) ** 2 * own.weight[:, None]).sum()
     assert after.sum() < 0.02 * before
     assert math.isfinite(float((left @ right).sum()))
+
+
+def test_an_uneven_wall_is_found_from_what_it_shifts(rendered):
+    """Tilts of some thousandths that change over the image, and texture, behind noise."""
+    data, held = (wall_data(rendered[0], 32, PLANE, every=2, first=k) for k in (0, 1))
+    state = WallState(
+        Pose(target_offset_m=(-0.17, 0.0)),
+        SlopeTable.of_lobes(np.array([[0.1, 0.1]]), np.array([2e3]), scale=0.1),
+    )
+    rng = np.random.default_rng(8)
+    x, y = (np.interp(v, (v.min(), v.max()), (0, 2 * np.pi)) for v in (data.columns, data.rows))
+    tilt, texture = 4e-3 * np.stack([np.sin(x), np.cos(y)], axis=1), 1 + 0.05 * np.sin(x + y)
+    seen = [state.light(one, tilt=tilt) * texture[:, None] for one in (data, held)]
+    noise = 2e-4 * seen[0].max()
+    own, other = (
+        replace(one, seen=light + rng.normal(0, noise, light.shape))
+        for one, light in zip((data, held), seen, strict=True)
+    )
+    plain = [state.light(one) for one in (own, other)]
+    found, after, shares = uneven_wall(own, other, state, *plain)
+    bright = plain[0].mean(axis=1) > np.median(plain[0].mean(axis=1))
+    for part, true in zip(found.T, (texture - 1, *tilt.T), strict=True):
+        assert np.corrcoef(part[bright], true[bright])[0, 1] > 0.8
+        assert 0.6 < np.polyfit(true[bright], part[bright], 1)[0] < 1.1
+    before = (other.shared_removed(other.seen - plain[1]) ** 2 * other.weight[:, None]).sum()
+    assert after.sum() < 0.15 * before
+    assert after.sum() < 1.1 * min(squares.sum() for squares in shares.values())  # it is nearly linear
 
 
 def test_a_setup_follows_its_files(fitted):

@@ -126,6 +126,7 @@ class TensorFile(Generic[Content]):
             they don't fit.
         thing: What it is ("a fitted wall").
         origin: Where it comes from ("the file that `evnlos calibrate` wrote").
+        later: Tensors that files of before lack; `build` does without them.
     """
 
     format: str
@@ -134,6 +135,7 @@ class TensorFile(Generic[Content]):
     build: Callable[..., Content]
     thing: str
     origin: str
+    later: tuple[str, ...] = ()
 
     def write(self, path: str | Path, tensors: dict[str, torch.Tensor], about: Any) -> str:
         """Write a file atomically and return its checksum.
@@ -145,7 +147,7 @@ class TensorFile(Generic[Content]):
         if path.suffix != SUFFIX:
             raise ConfigError(f"{path} ends in {path.suffix or 'nothing'!r}; give a name that ends in {SUFFIX}")
         content = sealed_bytes(
-            {name: tensors[name].contiguous() for name in self.names},
+            {name: tensors[name].contiguous() for name in (*self.names, *self.later)},
             json.dumps({"format": self.format, "about": to_dict(about)}),
         )
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -175,7 +177,8 @@ class TensorFile(Generic[Content]):
             )
         try:
             about = from_dict(self.about, found.get("about", {}), source=str(path))
-            return self.build(about=about, **{name: tensors[name] for name in self.names})
+            names = (*self.names, *(name for name in self.later if name in tensors))
+            return self.build(about=about, **{name: tensors[name] for name in names})
         except (ConfigError, DataError, ValueError) as error:
             raise DataError(f"{path} garbles its description: {error}") from None
 

@@ -122,22 +122,25 @@ class WallState:
         pose: Camera, wall and target.
         table: The facets' slopes, white levels included.
         sensitivity: Logarithm of the pixels' sensitivity: coefficients of `WallData.monomials` [5].
+
+    What its methods take as `tilt` are slopes of the wall where each pixel sees it, beside its bend, [P, 2].
     """
 
     pose: Pose
     table: SlopeTable
     sensitivity: Array = field(default_factory=lambda: np.zeros(5))
 
-    def place(self, data: WallData, pose: Pose | None = None) -> tuple[Seen, Cells]:
+    def place(self, data: WallData, pose: Pose | None = None, tilt: Array | None = None) -> tuple[Seen, Cells]:
         """Return wall points and target cells."""
         pose = self.pose if pose is None else pose
-        return seen_points(pose, data.shape, data.columns, data.rows), target_cells(pose, data.plane)
+        seen = seen_points(pose, data.shape, data.columns, data.rows, tilt=tilt)
+        return seen, target_cells(pose, data.plane)
 
-    def light(self, data: WallData, pose: Pose | None = None) -> Array:
+    def light(self, data: WallData, pose: Pose | None = None, tilt: Array | None = None) -> Array:
         """Return what the pixels see, without light that does not come from the targets, [P, N]."""
         out = np.empty(data.seen.shape)
         with torchs_threads():
-            carry_facets(out, *self.place(data, pose), self.table, MASKING, data.images)
+            carry_facets(out, *self.place(data, pose, tilt), self.table, MASKING, data.images)
         return out * np.exp(data.monomials() @ self.sensitivity)[:, None]
 
     def residual(self, data: WallData) -> Array:

@@ -1,4 +1,4 @@
-"""What pose and slopes leave: each pixel's sensitivity, light that travels along, a correction of the operator.
+"""What pose and slopes leave: sensitivity and tilt of each pixel, light that travels along, a correction.
 
 Each is fitted to the captures of the fit and kept only where captures that the fit has not seen get better.
 """
@@ -26,6 +26,9 @@ _COLUMNS = 160  # of the working images: finer texture is the fixed pattern's
 _COARSE = 64  # of those that the correction of the operator is estimated on
 _TEXTURE = 0.05  # standard deviation of a pixel's sensitivity about the smooth model
 _SMOOTH_PX = (2.0, 5.0)  # of the map of sensitivities, working pixels
+_TILT = 5e-3  # standard deviation of the wall's slope beside its bend
+_TILT_STEP = 2e-3  # of the finite difference
+_TILTED_PX = (1.0, 2.0)  # over which tilt and sensitivity are alike, working pixels
 _AMBIENT_PX = 3.0
 _LENGTHS_M = (0.01, 0.025)
 _LEVELS = (1e-2, 3e-2, 1e-1, 3e-1)
@@ -77,11 +80,18 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
         explained[name] = _share(error, after, floor)
         if _better(best, after):
             texture, best, kept = trial[:, 0], after, [name]
+    wavy, after, shares = uneven_wall(data, other, state, light, away)
+    explained |= {name: _share(error, squares, floor) for name, squares in shares.items()}
+    tilt = np.zeros((len(light), 2))
+    if _better(best, after):
+        texture, tilt, kept = 1 + wavy[:, 0], wavy[:, 1:], [min(shares, key=lambda name: shares[name].sum())]
+    tilts = np.stack([data.image(part, 0.0) for part in tilt.T])
     sensitivity = texture * np.exp(data.monomials() @ state.sensitivity)
 
     coarse, behind = _both(fit, held, _COARSE, plane, 2)
     factor = _resized(data.image(texture, 1.0), coarse.grid).ravel()
-    light, away = (state.light(d) * factor[d.pixel, None] for d in (coarse, behind))
+    turned = _resized(tilts, coarse.grid).reshape(2, -1).T
+    light, away = (state.light(d, tilt=turned[d.pixel]) * factor[d.pixel, None] for d in (coarse, behind))
     error, floor = _remaining_error(coarse, behind, light, away), _noise(behind, away)
     left, right, after = correction_of(coarse, light, behind, away)
     name = "correction of the operator"
@@ -101,7 +111,7 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
             [coarse.places[coarse.group == g].mean(axis=0) for g in range(coarse.group.max() + 1)]
         )
         own = factor[coarse.pixel] * np.exp(coarse.monomials() @ state.sensitivity)
-        found, carried = companion_of(coarse, state, shared, places, _COMPANION, own)
+        found, carried = companion_of(coarse, state, shared, places, _COMPANION, own, turned[coarse.pixel])
         before = _moving(coarse, there)
         after = _moving(coarse, there - carried)
         noise = floor.sum() / behind.seen.shape[1] * (len(places) - 1) / len(np.unique(behind.capture))
@@ -128,6 +138,7 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
         pictures.astype(np.float32),
         right.astype(np.float32),
         about,
+        tilts.astype(np.float32) if tilt.any() else np.zeros((2, 1, 1), np.float32),
     )
     return WallRest(wall, level, explained, tuple(kept))
 
@@ -230,6 +241,63 @@ def _smoothed(data: WallData, ratio: Array, precision: Array, smooth: float) -> 
     return 1 + (top / (below + 0.02)).ravel()[data.pixel]
 
 
+def uneven_wall(
+    data: WallData, other: WallData, state: WallState, light: Array, away: Array
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Return how much brighter and how tilted the wall is where each pixel sees it; what that leaves.
+
+    Around each pixel the residual is a linear function of three numbers, the relative sensitivity and the
+    slopes along x and y beside those of the bend: s light + t_x d light / d t_x + t_y d light / d t_y.
+    They are least squares over its neighbours, weighted by a Gaussian of some pixels, with priors of mean 0;
+    the width is chosen on the captures held out.
+
+    Args:
+        data: Frames of the fit.
+        other: Frames held out.
+        state: Pose and slopes.
+        light: The model's light of `data` [P, N].
+        away: The model's light of `other`.
+
+    Returns:
+        The three numbers of each pixel [P, 3]; the squares left of each capture held out [C], by light that is
+        computed again; and the same by the linear function, for each width.
+    """
+    from scipy.ndimage import gaussian_filter  # scipy loads slowly
+
+    both = []
+    for one, seen in ((data, light), (other, away)):
+        steps = _TILT_STEP * np.eye(2)
+        turned = [state.light(one, tilt=np.tile(step, (len(seen), 1))) - seen for step in steps]
+        both.append([seen, *(change / _TILT_STEP for change in turned)])
+    own, beyond = both
+    left = data.shared_removed(data.seen - light)
+    parts = [data.shared_removed(part) for part in own]
+    gram = [[(a * b).sum(axis=1) for b in parts] for a in parts]
+    right = [(a * left).sum(axis=1) for a in parts]
+    prior = np.mean(left**2) / np.array([_TEXTURE, _TILT, _TILT]) ** 2
+    best, shares = np.zeros((len(light), 3)), dict[str, Array]()
+    for width in _TILTED_PX:
+
+        def around(values: Array, width: float = width) -> Array:
+            return gaussian_filter(data.image(values, 0.0), width).ravel()[data.pixel]
+
+        near = around(np.ones(len(light)))
+        normal = np.moveaxis(np.array([[around(v) for v in row] for row in gram]) / near, 2, 0)
+        found = np.array([around(v) for v in right]) / near
+        # The neighbours are worth 4 pi width^2 pixels.
+        normal += np.diag(prior / (4 * np.pi * width**2))
+        change = np.linalg.solve(normal, found.T[..., None])[..., 0]
+        trial = [
+            sum(change[:, k, None] * part for k, part in enumerate(basis)) + basis[0] for basis in (own, beyond)
+        ]
+        after = _remaining_error(data, other, *trial)
+        if all(after.sum() < squares.sum() for squares in shares.values()):
+            best = change
+        shares[f"tilt and texture smooth over {width:g} pixels"] = after
+    again = [state.light(one, tilt=best[:, 1:]) * (1 + best[:, :1]) for one in (data, other)]
+    return best, _remaining_error(data, other, *again), shares
+
+
 def correction_of(data: WallData, light: Array, other: WallData, away: Array) -> tuple[Array, Array, Array]:
     """Return the correction of the operator that predicts held-out captures best; the squares it leaves [C].
 
@@ -272,7 +340,13 @@ def correction_of(data: WallData, light: Array, other: WallData, away: Array) ->
 
 
 def companion_of(
-    data: WallData, state: WallState, shared: Array, places: Array, plane: Plane, sensitivity: Array
+    data: WallData,
+    state: WallState,
+    shared: Array,
+    places: Array,
+    plane: Plane,
+    sensitivity: Array,
+    tilt: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return the image of what shines beside the target and moves along [h, w], and its light [P, S].
 
@@ -286,48 +360,32 @@ def companion_of(
         places: These places (x, y) [S, 2], metres.
         plane: Cells of the image, about the target's middle.
         sensitivity: Of each pixel [P].
+        tilt: Slopes of the wall there, beside its bend [P, 2].
     """
     from scipy.optimize import nnls  # scipy loads slowly
 
-    matrix = _moving_matrix(data, state, places, plane, sensitivity)
+    seen = seen_points(state.pose, data.shape, data.columns, data.rows, tilt=tilt)
+    here = target_cells(state.pose, plane)
+    matrix = np.empty(
+        (len(data.columns), len(places), plane.height * plane.width)
+    )  # of each cell at each place
+    for k, (x, y) in enumerate(places):
+        part = np.empty(matrix[:, k].shape)
+        cells = here._replace(points=here.points + np.array([x, y, x * state.pose.travel_slope]))
+        with torchs_threads():
+            fill_facets(part, seen, cells, state.table, MASKING)
+        matrix[:, k] = part * sensitivity[:, None]
     root = np.sqrt(data.weight)[:, None, None]
     a = ((matrix - matrix.mean(axis=1, keepdims=True)) * root).reshape(-1, matrix.shape[2])
     wanted = shared - shared.mean(axis=1, keepdims=True)
     gram, right = a.T @ a, a.T @ (wanted * root[..., 0]).ravel()
     level = 1e-3 * np.trace(gram) / len(right)
-    steps = _neighbours(plane)
+    rows, columns = np.eye(plane.height), np.eye(plane.width)
+    steps = np.vstack([np.kron(np.diff(rows, axis=0), columns), np.kron(rows, np.diff(columns, axis=0))])
     normal = gram + level * (steps.T @ steps) + 0.1 * level * np.eye(len(right))
     factor = np.linalg.cholesky(normal).T
     picture = np.minimum(nnls(factor, np.linalg.solve(factor.T, right))[0], _BRIGHTEST)
     return picture.reshape(plane.shape), matrix @ picture
-
-
-def _moving_matrix(data: WallData, state: WallState, places: Array, plane: Plane, sensitivity: Array) -> Array:
-    """Return what the pixels see of each cell of an image at each place, [P, S, h w]."""
-    seen = seen_points(state.pose, data.shape, data.columns, data.rows)
-    here = target_cells(state.pose, plane)
-    out = np.empty((len(data.columns), len(places), plane.height * plane.width))
-    for k, (x, y) in enumerate(places):
-        part = np.empty((len(out), out.shape[2]))
-        cells = here._replace(points=here.points + np.array([x, y, x * state.pose.travel_slope]))
-        with torchs_threads():
-            fill_facets(part, seen, cells, state.table, MASKING)
-        out[:, k] = part * sensitivity[:, None]
-    return out
-
-
-def _neighbours(plane: Plane) -> Array:
-    """Return the differences between neighbouring cells, [R, h w]."""
-    index = np.arange(plane.height * plane.width).reshape(plane.shape)
-    pairs = np.concatenate(
-        [
-            np.stack([index[1:].ravel(), index[:-1].ravel()], axis=1),
-            np.stack([index[:, 1:].ravel(), index[:, :-1].ravel()], axis=1),
-        ]
-    )
-    rows = np.zeros((len(pairs), index.size))
-    rows[np.arange(len(pairs)), pairs[:, 0]], rows[np.arange(len(pairs)), pairs[:, 1]] = 1, -1
-    return rows
 
 
 def _dense(data: WallData) -> Array:

@@ -1,6 +1,17 @@
 """A second renderer, for captures that the simulator's own models of a setup do not describe."""
 
-from evnlos.lab.light_path import LitCells, Lobe, Optics, Rays, Reflection, cast, fill_throughput, texture
+from evnlos.lab.light_path import (
+    LitCells,
+    Lobe,
+    Optics,
+    Rays,
+    Reflection,
+    cast,
+    fill_throughput,
+    texture,
+    tilted,
+    waves,
+)
 from evnlos.lab.room import FilmedLight, Mount, Phone, RenderedWall, Torch, brightness, covered_plane
 
 __all__ = [
@@ -19,4 +30,6 @@ __all__ = [
     "covered_plane",
     "fill_throughput",
     "texture",
+    "tilted",
+    "waves",
 ]

@@ -453,3 +453,40 @@ def texture(x_m: Array, y_m: Array, seed: int, smooth: float, fine: float, grain
             ky = 2 * np.pi / length[n] * np.sin(turn[n])
             value += deviation * np.sqrt(2 / waves) * np.cos(kx * x_m + ky * y_m + phase[n])
     return np.maximum(value, 0.05)
+
+
+def waves(x_m: Array, y_m: Array, seed: int, deviation: float) -> Array:
+    """Return the slopes dz/dx, dz/dy of an uneven wall at points of any shape, [..., 2]: a sum of waves.
+
+    Args:
+        x_m: x of the points, metres.
+        y_m: y of the points, metres.
+        seed: Seed of the waves.
+        deviation: Standard deviation of either slope (waves of 8 to 60 mm).
+    """
+    draw, count = np.random.default_rng([seed, 1]), 24
+    length = np.exp(draw.uniform(np.log(0.008), np.log(0.06), count))
+    turn, phase = draw.uniform(0, 2 * np.pi, (2, count))
+    slopes = np.zeros((*np.shape(x_m), 2))
+    for n in range(count):
+        way = np.array([np.cos(turn[n]), np.sin(turn[n])])
+        along = 2 * np.pi / length[n] * (way[0] * x_m + way[1] * y_m) + phase[n]
+        slopes += deviation * np.sqrt(4 / count) * np.cos(along)[..., None] * way
+    return slopes
+
+
+def tilted(rays: Rays, slopes: Array) -> Rays:
+    """Return rays that meet a wall of further slopes; the height of its waves, micrometres, is left out.
+
+    Args:
+        rays: What the pixels see.
+        slopes: dz/dx and dz/dy of the waves where they meet the wall, [P, S, 2].
+    """
+    eye = np.einsum("psij,psi->psj", rays.frame, rays.eye)
+    normal = rays.frame[..., 2, :] / rays.frame[..., 2, 2:]
+    normal = normal - np.concatenate([slopes, np.zeros_like(slopes[..., :1])], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    along_x = np.cross(np.array([0.0, 1.0, 0.0]), normal)
+    along_x /= np.linalg.norm(along_x, axis=-1, keepdims=True)
+    frame = np.stack([along_x, np.cross(normal, along_x), normal], axis=-2)
+    return rays._replace(frame=frame, eye=np.einsum("psij,psj->psi", frame, eye))

@@ -382,7 +382,12 @@ class Pose:
 
 
 def seen_points(
-    pose: Pose, shape: tuple[int, int], columns: Array, rows: Array, pixel_aspect: float = 1.0
+    pose: Pose,
+    shape: tuple[int, int],
+    columns: Array,
+    rows: Array,
+    pixel_aspect: float = 1.0,
+    tilt: Array | None = None,
 ) -> Seen:
     """Return the wall points that a camera sees at given places of its image.
 
@@ -395,6 +400,7 @@ def seen_points(
         columns: Columns of the places [P], pixels; pixel centres are whole numbers.
         rows: Their rows [P].
         pixel_aspect: Height of a pixel over its width.
+        tilt: Slopes of the wall along x and y at each place, beside those of its curvatures, [P, 2].
 
     Raises:
         ConfigError: Some of the pixels do not see the wall.
@@ -424,6 +430,8 @@ def seen_points(
         along = along - gap / (ray[:, 2] - (at * ray) @ bend)
     points = eye + along[:, None] * ray
     tilt_x, tilt_y = bend[0] * points[:, 0], bend[1] * points[:, 1]
+    if tilt is not None:
+        tilt_x, tilt_y = tilt_x + tilt[:, 0], tilt_y + tilt[:, 1]
     normal = np.stack([-tilt_x, -tilt_y, np.ones_like(tilt_x)], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     first = np.stack([np.ones_like(tilt_x), np.zeros_like(tilt_x), tilt_x], axis=1)
@@ -494,6 +502,7 @@ def facet_matrix(
     source: Plane,
     dtype: type = np.float32,
     pixel_aspect: float = 1.0,
+    tilt: Array | None = None,
 ) -> NDArray:
     """Return the matrix from the brightness of target cells to the light of camera pixels, [H W, h w].
 
@@ -506,6 +515,7 @@ def facet_matrix(
         source: Cells, in the coordinates of the target's motion.
         dtype: float32 or float64.
         pixel_aspect: Height of a pixel over its width.
+        tilt: Slopes of the wall at each pixel, beside those of its curvatures, [H W, 2].
     """
     height, width = shape
     cells = target_cells(pose, source)
@@ -513,7 +523,7 @@ def facet_matrix(
     rows, columns = np.meshgrid(
         np.arange(height, dtype=np.float64), np.arange(width, dtype=np.float64), indexing="ij"
     )
-    seen = seen_points(pose, shape, columns.ravel(), rows.ravel(), pixel_aspect)
+    seen = seen_points(pose, shape, columns.ravel(), rows.ravel(), pixel_aspect, tilt)
     with torchs_threads():
         for here in noted_rows(len(out)):
             fill_facets(out[here], seen.part(here), cells, table, MASKING)

@@ -225,6 +225,8 @@ class FittedWall:
         left: Correction of the operator, float32 [R, h, w]: R images of the camera image, any size.
         right: Their weights over the cells of `about.corrected`, float32 [R, h w].
         about: Geometry of the arrays, and notes.
+        tilt: Slopes of the wall along x and y at the pixels, beside its bend, float32 [2, h, w], of any
+            size.
 
     Raises:
         DataError: The arrays do not fit each other, or hold NaN.
@@ -237,6 +239,7 @@ class FittedWall:
     left: np.ndarray
     right: np.ndarray
     about: AboutWall
+    tilt: np.ndarray = field(default_factory=lambda: np.zeros((2, 1, 1), np.float32))
 
     def __post_init__(self) -> None:
         nodes, plane = len(self.log_density), self.about.corrected
@@ -255,7 +258,9 @@ class FittedWall:
                 f"{self.log_density.shape}; give two images and "
                 "an odd number of nodes from 5"
             )
-        for name in _ARRAYS:
+        if self.tilt.ndim != 3 or len(self.tilt) != 2 or not self.tilt.size:
+            raise DataError(f"tilt is {self.tilt.shape}; give two images")
+        for name in (*_ARRAYS, "tilt"):
             if not np.isfinite(getattr(self, name)).all():
                 raise DataError(f"{name} holds NaN or infinity; calibrate again")
 
@@ -265,7 +270,7 @@ class FittedWall:
         return SlopeTable(self.log_density, self.about.scale, self.about.step, self.about.matte)
 
     def image(self, name: str, shape: tuple[int, int]) -> torch.Tensor:
-        """Return `sensitivity`, `ambient` or `left` for an image of `shape` (H, W), float32 [..., H, W]."""
+        """Return `sensitivity`, `ambient`, `left` or `tilt` for an image of `shape` (H, W), [..., H, W]."""
         picture = torch.from_numpy(getattr(self, name))
         if tuple(picture.shape[-2:]) == tuple(shape) or not picture.numel():
             return picture.reshape(*picture.shape[:-2], *shape)
@@ -290,6 +295,7 @@ WALL = TensorFile(
     _wall,
     "a fitted wall",
     "the file that `evnlos calibrate` wrote beside setup.yaml",
+    ("tilt",),
 )
 """Fitted walls on disk."""
 WALL_FILE = "wall.safetensors"
@@ -302,7 +308,7 @@ def write_fitted(path: str | Path, wall: FittedWall) -> str:
     Raises:
         ConfigError: The name does not end in .safetensors.
     """
-    arrays = {name: torch.tensor(getattr(wall, name)) for name in _ARRAYS}
+    arrays = {name: torch.tensor(getattr(wall, name)) for name in (*_ARRAYS, "tilt")}
     return WALL.write(path, arrays, wall.about)
 
 

@@ -161,7 +161,8 @@ class FittedSetup(Setup):
         fitted = self.fitted()
         kind = np.float32 if dtype == torch.float32 else np.float64
         aspect = self.sensor.aspect_at(shape)
-        made = facet_matrix(self.pose(), self.table(), shape, source, kind, pixel_aspect=aspect)
+        tilt = fitted.image("tilt", shape).flatten(1).T.double().numpy() if fitted.tilt.any() else None
+        made = facet_matrix(self.pose(), self.table(), shape, source, kind, aspect, tilt)
         matrix = torch.from_numpy(made)
         matrix *= fitted.image("sensitivity", shape).flatten().to(matrix)[:, None]
         if len(fitted.left) and self.correction:

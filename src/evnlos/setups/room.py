@@ -26,6 +26,8 @@ from evnlos.lab import (
     covered_plane,
     fill_throughput,
     texture,
+    tilted,
+    waves,
 )
 from evnlos.optics import MatrixTransport
 from evnlos.optics.radiometric import noted_rows
@@ -66,9 +68,11 @@ class RoomSetup(Setup):
     grain: float = 1.0
     """How many times longer the fine waves are along x: above 1 on a brushed wall."""
     texture_seed: int = 0
-    """Seed of the texture: one wall for all recordings."""
+    """Seed of texture and waves: one wall for all recordings."""
     curvature: tuple[float, float] = (0.0, 0.0)
     """Curvatures of the wall along x and y, 1/metre; positive bulges into the room."""
+    waviness: float = 0.0
+    """Standard deviation of the wall's slopes beside its curvature, in waves of 8 to 60 mm."""
     distance_m: float = 0.3
     """Distance from target to wall where the scene states none, metres."""
     target_offset_m: tuple[float, float] | None = None
@@ -111,7 +115,7 @@ class RoomSetup(Setup):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"RoomSetup.{name} is {value}; give a positive number")
-        for name in ("texture_smooth", "texture_fine", "ambient", "aperture_m", "ripple_hz"):
+        for name in ("texture_smooth", "texture_fine", "waviness", "ambient", "aperture_m", "ripple_hz"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ConfigError(f"RoomSetup.{name} is {value}; give 0 or more")
@@ -138,6 +142,7 @@ class RoomSetup(Setup):
         if self.texture_smooth or self.texture_fine:
             parts.append(f"texture {100 * math.hypot(self.texture_smooth, self.texture_fine):.2g} %")
         parts += ["curved"] if any(self.curvature) else []
+        parts += [f"waves of slope {self.waviness:g}"] if self.waviness else []
         parts += ["torch-lit target"] if self.lamp else []
         return "second renderer: " + ", ".join(parts or ["matte"])
 
@@ -254,6 +259,7 @@ class RoomSetup(Setup):
             )
         x, y, _ = np.moveaxis(rays.point, -1, 0)
         albedo = texture(x, y, self.texture_seed, self.texture_smooth, self.texture_fine, self.grain)
+        rays = tilted(rays, waves(x, y, self.texture_seed, self.waviness)) if self.waviness else rays
         return rays._replace(share=rays.share * albedo)
 
     def throughput(self, shape: tuple[int, int], plane: Plane) -> NDArray[np.float32]:
