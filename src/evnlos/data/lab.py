@@ -340,8 +340,8 @@ class _FilteredWall:
     """The light of three walls, one a colour, behind Bayer filters: each pixel sees that of its own."""
 
     def __init__(self, walls: list[Irradiance], mosaic: Mosaic) -> None:
-        self.walls, self.mosaic, self.shape = walls, mosaic, walls[0].shape
-        self.speed_px_s = max(one.speed_px_s for one in walls)
+        self.walls, self.shape, self.speed_px_s = walls, walls[0].shape, max(one.speed_px_s for one in walls)
+        self.mosaic: Mosaic = mosaic
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
         light = torch.stack([one.irradiance(t_s) for one in self.walls], dim=-1)
