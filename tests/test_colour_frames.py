@@ -1,4 +1,4 @@
-"""Frames in colour: filters on the pixels, one colour of a capture, a coloured lab, pictures in colour."""
+"""Frames and events in colour: filters on pixels, one colour of a capture, a coloured lab, its pictures."""
 
 import json
 import shutil
@@ -12,14 +12,16 @@ import yaml
 from PIL import Image
 
 from evnlos import FrameCamera, read_capture
-from evnlos.cameras import colour_filters, mosaicked, of_mosaic
+from evnlos.cameras import EventPixel, colour_filters, mosaicked, of_mosaic
 from evnlos.cli import main
-from evnlos.config import save_yaml, to_dict
+from evnlos.config import from_dict, save_yaml, to_dict
+from evnlos.data import CaptureInfo
 from evnlos.data.capture_check import check_capture
+from evnlos.data.fixed_pattern import own_pixels, used_pixels
 from evnlos.data.lab import Lab, render_captures
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs
-from evnlos.types import COLOURS, LUMA_601, Mosaic
+from evnlos.types import COLOURS, LUMA_601, Events, Mosaic
 
 MOSAICS = get_args(Mosaic)
 WEIGHTS = np.array(LUMA_601) / 1000
@@ -242,5 +244,132 @@ def test_a_picture_in_colour(coloured, tmp_path, capsys):
             main(["invert", *given, *words, "--colours", "--out", str(tmp_path / "wrong.png")])
         assert told in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["invert", str(coloured["grey"]), *words[:2], "--colours", "--from", "frames"])
-    assert "--colours takes captures, by the solvers" in capsys.readouterr().err
+        main(["invert", str(coloured["grey"]), *words[:2], "--colours", "--from", "frames", "--samples", "3"])
+    assert "--colours takes captures with a --setup; leave --samples" in capsys.readouterr().err
+
+
+QUIET = EventPixel(0.1, 0.1, 0.0, 0.0, 0.0, 0.0, initial_phase="rest", logarithm="true")
+
+
+def event_lab(name: str, **changes) -> Lab:
+    """Return a lab without noise of an event, whose instants do not depend on what is seen."""
+    lab = lab_of()
+    setup = replace(lab.setup, pixel=QUIET, ambient=0.1, gain=1.0, cell_m=0.01, time_step_s=0.02)
+    setup = replace(setup, frame_camera=FrameCamera(exposure_s=0.016, full_well_e=1e5, read_noise_e=100.0))
+    setup = replace(setup, sensor=replace(setup.sensor, height=36, width=54))
+    given = {"name": name, "setup": setup, "mosaic": "grbg", "event_mosaic": "bggr", "duration_s": 8.0}
+    return replace(lab, **{**given, **changes})
+
+
+@pytest.fixture(scope="module")
+def filtered(tmp_path_factory) -> dict[str, Path]:
+    """Return captures of a letter before a grey event camera and one with filters, and their setup."""
+    out = tmp_path_factory.mktemp("filtered")
+    labs = {
+        "grey": event_lab("grey", mosaic=None, event_mosaic=None),
+        "white": event_lab("white"),
+        "bands": event_lab("bands", palette=("ff0000", "0000ff")),
+    }
+    made = {name: render_captures(lab, out, record=f"{name}.yaml")[0] for name, lab in labs.items()}
+    save_yaml(to_dict(labs["grey"].setup), out / "setup.yaml")
+    return {**made, "setup": out / "setup.yaml"}
+
+
+def of_pixels(events: Events, own: np.ndarray) -> np.ndarray:
+    """Return instants, places and signs of the events of some pixels, [N, 4]."""
+    kept = own[events.y, events.x]
+    return np.stack([events.t_us, events.y, events.x, events.p], axis=1)[kept]
+
+
+def test_an_event_pixel_sees_the_light_of_its_filter(filtered, tmp_path):
+    """As on a sensor whose every pixel has this filter; nothing green moves, so that green says nothing."""
+    lab = event_lab("one", palette=("ff0000", "0000ff"), mosaic=None, event_mosaic=None)
+    seen, scene = read_capture(filtered["bands"]), lab.glyphs.objects()[0]
+    assert seen.info.camera.event_mosaic == "bggr" and seen.info.camera.white_balance == lab.white_balance
+    filters = colour_filters("bggr", (36, 54))
+    white = np.array(lab.white_balance) / (WEIGHTS @ lab.white_balance)
+    assert not len(of_pixels(seen.events, filters[1]))
+    for k, length_m in ((0, 650e-9), (2, 450e-9)):
+        shown = tuple(("ffffff" if int(one[2 * k : 2 * k + 2], 16) else "000000") for one in lab.palette)
+        setup = replace(
+            lab.setup, gain=white[k] * lab.setup.gain, ambient=white[k] * 0.1, wavelength_m=length_m
+        )
+        alone = replace(lab, setup=setup, palette=shown)
+        whole = read_capture(render_captures(alone, tmp_path / COLOURS[k], [scene])[0]).events
+        found, expected = of_pixels(seen.events, filters[k]), of_pixels(whole, filters[k])
+        assert found.shape == expected.shape and len(found) > 100
+        assert np.abs(found - expected).max() <= 1
+
+
+def test_a_filter_changes_no_contrast(tmp_path):
+    """A true logarithm knows no scale: a white letter on a wall without colour sends a grey camera's events."""
+    setup = replace(event_lab("wall").setup, wall_material="lambert", distance_m=0.1)
+    told = []
+    for event_mosaic in (None, "rggb"):
+        lab = event_lab("wall", setup=setup, mosaic=None, event_mosaic=event_mosaic)
+        events = read_capture(render_captures(lab, tmp_path / str(event_mosaic))[0]).events
+        told.append(of_pixels(events, np.ones((36, 54), bool)))
+    order = [np.lexsort((one[:, 0], one[:, 2], one[:, 1])) for one in told]
+    grey, behind = (one[by] for one, by in zip(told, order, strict=True))
+    assert grey.shape == behind.shape and len(grey) > 1000
+    assert (grey[:, 1:] == behind[:, 1:]).all() and np.abs(grey[:, 0] - behind[:, 0]).max() < 2000
+
+
+def test_filters_are_those_of_the_pixels_that_are_used():
+    """A region that begins at an odd row and every third pixel: as where each pixel sends its own number."""
+    height, width = 14, 20
+    roi = {"x": 3, "y": 1, "width": 15, "height": 12}
+    said = {"camera": {"width": width, "height": height, "event_mosaic": "gbrg"}, "roi": roi}
+    y, x = (one.ravel().astype(np.uint16) for one in np.mgrid[0:height, 0:width])
+    events = Events(np.arange(height * width), x, y, np.ones(height * width, bool), width, height)
+    filters = colour_filters("gbrg", (height, width)).reshape(3, -1)
+    for every in (1, 3):
+        info = from_dict(CaptureInfo, {**said, "every": every}, source="test")
+        used, _, _ = used_pixels(info, events, np.zeros((1, height, width), np.uint8))
+        for k, colour in enumerate(COLOURS):
+            own = own_pixels(info, colour, "events")
+            assert own.shape == used.shape
+            np.testing.assert_array_equal(own[used.y, used.x], filters[k][used.t_us])
+            assert own_pixels(info, colour, "frames").all()
+    with pytest.raises(ConfigError, match=r"no pixel for .* state an odd `every`"):
+        for colour in COLOURS:
+            own_pixels(from_dict(CaptureInfo, {**said, "every": 2}, source="test"), colour, "events")
+
+
+def test_events_give_a_picture_in_colour(filtered, tmp_path, capsys):
+    words = ["--setup", str(filtered["setup"]), "--json", "--force", "--out", str(tmp_path / "found.png")]
+    rows, images = {}, {}
+    for name, evidence in (("grey", "events"), ("white", "events"), ("bands", "events"), ("bands", "both")):
+        colours = [] if name == "grey" else ["--colours"]
+        main(["invert", str(filtered[name]), *words, "--from", evidence, *colours])
+        rows[name, evidence] = json.loads(capsys.readouterr().out)["rows"][0]
+        images[name, evidence] = np.load(tmp_path / "found.npz")[filtered[name].name]
+    for key in (("bands", "events"), ("bands", "both")):
+        red, green, blue = images[key]
+        upper, lower = slice(3, 14), slice(18, 29)
+        assert red[upper].mean() > 10 * abs(blue[upper].mean())
+        assert blue[lower].mean() > 10 * abs(red[lower].mean())
+        assert abs(green).mean() < 0.5 * red.mean()  # in silence, or below the frames' noise
+        assert rows[key]["psnr_db"] > rows["grey", "events"]["psnr_db"]
+    grey, white = images["grey", "events"], images["white", "events"]
+    for one in white:
+        assert np.sqrt(np.mean((one - grey) ** 2)) < 0.1
+    row = rows["white", "events"]
+    np.testing.assert_allclose(row["level"], np.mean(row["level"]), rtol=0.03)  # white is white
+    assert row["psnr_db"] > rows["grey", "events"]["psnr_db"] - 2
+
+
+def test_what_is_of_no_colour_is_refused(filtered, coloured, tmp_path, capsys):
+    words = ["--setup", str(filtered["setup"]), "--colours", "--out", str(tmp_path / "found.png")]
+    for folder, evidence, told in (
+        (filtered["grey"], "events", "its events are grey"),
+        (filtered["grey"], "both", "its frames are grey"),
+        (coloured["bands"], "both", "its events are grey"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["invert", str(folder), *words, "--from", evidence])
+        assert told in capsys.readouterr().err
+    for camera, told in (("event_mosaic", "rgbg"), ("event_mosaic", "rggb")):
+        said = {"camera": {"width": 8, "height": 6, camera: told}, "events": None}
+        with pytest.raises(ConfigError, match="event_mosaic"):
+            from_dict(CaptureInfo, said, source="test")

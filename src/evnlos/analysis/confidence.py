@@ -2,11 +2,13 @@
 
 - Test-time data consistency: move a network's image to where the calibrated wall agrees with the frame.
 - How much of what the frames show the images explain: the light path run forward again.
+- Whether a setup fits the light and the events of a capture whose target is solved for.
 - Is the confidence right? Support against skill, and coverage of the intervals, sequence by sequence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -344,3 +346,35 @@ def risk_coverage(support: ArrayLike, risk: ArrayLike) -> tuple[NDArray[np.float
     order = np.argsort(-np.asarray(support, np.float64), kind="stable")
     ranks = np.arange(1, len(order) + 1)
     return ranks / len(order), np.cumsum(np.asarray(risk, np.float64)[order]) / ranks
+
+
+_MOST_LEFT = 0.1  # of the light's own changes
+_FURTHEST = 0.15  # of fitted thresholds from the setup's, relative
+
+
+def shares_left(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Return what the setup leaves unexplained of each capture, by most positions, where enough are told."""
+    told = sorted((row for row in rows if row.get("unexplained") is not None), key=lambda row: row["positions"])
+    return {row["capture"]: row["unexplained"] for row in told}
+
+
+def sequence_doubts(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return why images are not to be believed, a line each."""
+    return [
+        f"{name}: the setup leaves {100 * share:.0f} % of the light unexplained beside the noise, right ones 1 "
+        "to 3 %: do not believe the image; calibrate this very setup (`evnlos calibrate`)"
+        for name, share in shares_left(rows).items()
+        if share > _MOST_LEFT
+    ] + [
+        f"{row['capture']}: the events fit the setup only with thresholds {row['threshold_factors']} times its "
+        "own; do not believe the image, calibrate pixel and optics on this sensor"
+        for row in rows
+        if any(abs(factor - 1) > _FURTHEST for factor in np.ravel(row.get("threshold_factors", ())))
+    ]
+
+
+def levels_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Return how bright each colour of pictures is over the truth, in the mean; "" where none is known."""
+    levels = [one for row in rows if isinstance(one := row["level"], list) and None not in one]
+    told = "red, green, blue are {:.2f}, {:.2f}, {:.2f} of the truth"
+    return told.format(*np.mean(levels, axis=0)) if levels else ""

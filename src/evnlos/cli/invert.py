@@ -67,7 +67,7 @@ class InvertCommand:
     subsets: int = 1
     """Captures: choices of so many positions to average the scores over."""
     colours: bool = False
-    """Captures: an image in colour, by the solvers, of frames in colour."""
+    """Captures: an image in colour, of frames in colour, with --from of events behind colour filters too."""
     evidence: Annotated[Literal["frames", "events", "both"] | None, tyro.conf.arg(name="from")] = None
     """Captures: estimate the target from these by one likelihood of the whole sequence and a Gaussian prior of
     handwriting, with the uncertainty of each cell; none = the solvers, which take frames. Events need the
@@ -111,8 +111,8 @@ class InvertCommand:
                 raise ConfigError(f"--{flag.replace('_', '-')} is {value:g}; give {least} or more")
         if self.regularization == "gcv" and self.solver != "tikhonov":
             raise ConfigError("--regularization gcv serves --solver tikhonov only; give that, or a number")
-        if self.colours and (self.setup is None or self.evidence or self.changing or self.pattern):
-            raise ConfigError("--colours takes captures, by the solvers; leave --from, --changing, --pattern")
+        if self.colours and (self.setup is None or self.samples or self.changing or self.pattern):
+            raise ConfigError("--colours takes captures with a --setup; leave --samples, --changing, --pattern")
         if self.samples and self.evidence is None:
             raise ConfigError(f"--samples {self.samples} takes --from frames, events or both; give one of them")
         if self.setup is not None:
@@ -198,6 +198,7 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
+        from evnlos.analysis.confidence import levels_text, sequence_doubts, shares_left
         from evnlos.cli import invert_captures as work
         from evnlos.plot.results import draw_inversion
 
@@ -221,16 +222,16 @@ class InvertCommand:
         with ProgressBars() as progress:
             invert = work.invert_colours if self.colours else work.invert_captures
             found, pictures = invert(self.files, options, progress)
-        for doubt in work.sequence_doubts(found["rows"]):
+        for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
         most = max(row["positions"] for row in found["rows"])
         best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
         panels = [(name, image if self.colours else image[None]) for name, image in best.items()]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         save_arrays(self.out, pictures)
-        if levels := [row["level"] for row in found["rows"] if self.colours and None not in row["level"]]:
-            say("red, green, blue are {:.2f}, {:.2f}, {:.2f} of the truth".format(*np.mean(levels, axis=0)))
-        left = work.shares_left(found["rows"]).values()
+        if told := levels_text(found["rows"]):
+            say(told)
+        left = shares_left(found["rows"]).values()
         told = f"{100 * max(left):.1f} % of the light unexplained beside the noise; " if left else ""
         table = (
             f"{' '.join(found['captures'])}\n{work.sequence_table(found['rows'])}\n{told}{found['seconds']} s"
@@ -291,21 +292,23 @@ class InvertCommand:
         print(json.dumps(result) if self.json else film_text(result))
 
     def _estimate(self, setup: Path, evidence: Literal["frames", "events", "both"]) -> None:
-        from evnlos.cli.invert_captures import estimate_captures, sequence_doubts, sequence_text
+        from evnlos.analysis.confidence import levels_text, sequence_doubts
+        from evnlos.cli.invert_captures import estimate_captures, sequence_text
         from evnlos.plot.results import draw_inversion
 
         if self.positions or self.track or self.solver != "all":
-            raise ConfigError(
-                "--from takes whole sequences of known motion; leave --positions, --track, --solver"
-            )
+            raise ConfigError("--from takes sequences of known motion; leave --positions, --track, --solver")
         with ProgressBars() as progress:
             how = evidence, self.pattern, self.samples
-            found, pictures = estimate_captures(self.files, setup, *how, progress)
+            found, pictures = estimate_captures(self.files, setup, *how, progress, self.colours)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
-        panels = [(name, image[None]) for name, image in pictures.items() if image.ndim == 2]
+        sides = 2 + self.colours
+        panels = [(n, one.view(-1, *one.shape[-2:])) for n, one in pictures.items() if one.ndim == sides]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         save_arrays(self.out, pictures)
+        if told := levels_text(found["rows"]):
+            say(told)
         print(json.dumps(found) if self.json else sequence_text(found))
 
 

@@ -24,13 +24,9 @@ from evnlos.calibration.scan.importer import stills_as_scanned
 from evnlos.cli.parsing import say
 from evnlos.data import Capture, load_pattern, pattern_of, read_capture
 from evnlos.data.fixed_pattern import object_light
+from evnlos.data.sampling import read_target
 from evnlos.errors import ConfigError
-from evnlos.inverse import (
-    SequenceLights,
-    SequenceOperator,
-    SequenceProblem,
-    unexplained,
-)
+from evnlos.inverse import SequenceLights, SequenceOperator, SequenceProblem, unexplained
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
@@ -156,17 +152,27 @@ def invert_colours(
     parts = [invert_captures(folders, replace(options, colour=one), progress) for one in COLOURS]
     pictures = {name: torch.stack([found[name] for _, found in parts]) for name in parts[0][1]}
     for name, image in pictures.items():
-        if torch.equal(image[0], image[1]) and torch.equal(image[1], image[2]):
-            raise ConfigError(f"{name}: its frames are grey; leave it or --colours, or state camera.mosaic")
+        _check_coloured(name, image)
     rows = []
     for same in zip(*(figures["rows"] for figures, _ in parts), strict=True):
-        errors = [10 ** (-0.1 * row["psnr_db"]) for row in same if row["psnr_db"] is not None]
         # The least, as a colour that the target hardly has tells nothing of the setup.
         shares = [row["unexplained"] for row in same if row["unexplained"] is not None]
         row = {**same[0], "unexplained": min(shares, default=None), "level": [row["level"] for row in same]}
-        rows.append({**row, "psnr_db": round(-10 * math.log10(np.mean(errors)), 3) if errors else None})
+        rows.append({**row, "psnr_db": _decibel_of(same, "psnr_db")})
     seconds = sum(figures["seconds"] for figures, _ in parts)
     return {**parts[0][0], "rows": rows, "seconds": round(seconds, 1)}, pictures
+
+
+def _check_coloured(name: str, images: Sequence[Any] | torch.Tensor) -> None:
+    """Raise `ConfigError` where red, green and blue are the same."""
+    if all(np.array_equal(images[0], one) for one in images):
+        raise ConfigError(f"{name}: its frames are grey; leave it or --colours, or state camera.mosaic")
+
+
+def _decibel_of(rows: Sequence[dict[str, Any]], key: str) -> float | None:
+    """Return the decibels of the mean square over the colours; None where none is known."""
+    errors = [10 ** (-0.1 * row[key]) for row in rows if row[key] is not None]
+    return round(-10 * math.log10(np.mean(errors)), 3) if errors else None
 
 
 def _solve(
@@ -262,18 +268,18 @@ def figures_of(name: str, solution: Solution) -> dict[str, Any]:
     }
 
 
-_MOST_LEFT = 0.1  # of the light's own changes
-_FURTHEST = 0.15  # of fitted thresholds from the setup's, relative
+Evidence = Literal["frames", "events", "both"]
 _SHOWN = 3  # samples that stand beside an image
 
 
 def estimate_captures(
     folders: Sequence[Path],
     word: Path,
-    evidence: Literal["frames", "events", "both"],
+    evidence: Evidence,
     pattern: Path | None,
     samples: int = 0,
     progress: Progress = silent,
+    colours: bool = False,
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and of each capture the target [cells, cells] and its standard deviation, by name.
 
@@ -284,25 +290,49 @@ def estimate_captures(
         pattern: Fixed pattern of the frame camera; without it an offset of each pixel is integrated out.
         samples: Samples under the learned prior; 0: the Gaussian prior, without any.
         progress: Called as each capture is done.
+        colours: Whether the target is solved in red, green and blue: [3, cells, cells].
 
     Raises:
-        ConfigError: The setup is not linear, its event model states no law, or a motion is unknown.
+        ConfigError: The setup is not linear or has no law of events, a motion is unknown, or colours are grey.
     """
     setup, prior = linear_setup(word), load_prior() if samples else None
-    known = None if pattern is None else load_pattern(pattern)
-    lights = SequenceLights()
+    how = evidence, pattern and load_pattern(pattern), prior, samples, SequenceLights()
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
-        capture = read_capture(folder, needs_frames=evidence != "events", needs_events=evidence != "frames")
-        found = estimate_target(capture, setup, evidence, known, prior, samples, lights)
-        rows.append(_row(capture, found))
-        pictures[capture.name] = torch.from_numpy(found.image)
-        pictures[f"{capture.name} deviation"] = torch.from_numpy(found.deviation)
-        if found.samples is not None:
-            for k, one in enumerate(found.samples[:_SHOWN], 1):
-                pictures[f"{capture.name} sample {k}"] = one
-            pictures[f"{capture.name} samples"] = found.samples
+        seen = _read_colours(folder, evidence) if colours else {None: _read(folder, evidence)}
+        each = [estimate_target(one, setup, *how, colour) for colour, one in seen.items()]
+        parts = [_row(*pair) for pair in zip(seen.values(), each, strict=True)]
+        name = parts[0]["capture"]
+        rows.append(_row_of_colours(parts) if colours else parts[0])
+        for title, part in ((name, "image"), (f"{name} deviation", "deviation")):
+            images = [torch.from_numpy(getattr(one, part)) for one in each]
+            pictures[title] = torch.stack(images) if colours else images[0]
+        if (drawn := each[0].samples) is not None:
+            shown = {f"{name} sample {k}": one for k, one in enumerate(drawn[:_SHOWN], 1)}
+            pictures |= {**shown, f"{name} samples": drawn}
     return {"setup": str(word), "from": evidence, "rows": rows}, pictures
+
+
+def _read(folder: Path, evidence: Evidence, colour: Colour | None = None) -> Capture:
+    frames, events = evidence != "events", evidence != "frames"
+    return read_capture(folder, needs_frames=frames, needs_events=events, colour=colour)
+
+
+def _read_colours(folder: Path, evidence: Evidence) -> dict[Colour | None, Capture]:
+    """Return a capture in each colour; where events count alone its frames, which tell the time, stay grey."""
+    if evidence != "events":
+        found: dict[Colour | None, Capture] = {one: _read(folder, evidence, one) for one in COLOURS}
+        _check_coloured(folder.name, [one.frames for one in found.values()])
+        return found
+    grey = _read(folder, evidence)
+    return {one: replace(grey, target=read_target(folder, grey.info.target, one)) for one in COLOURS}
+
+
+def _row_of_colours(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return lists of the figures of each colour; decibels are of the mean square, the time is that of all."""
+    row: dict[str, Any] = {key: [one[key] for one in rows] for key in rows[0]}
+    row |= {"capture": rows[0]["capture"], "seconds": round(sum(row["seconds"]), 1)}
+    return row | {key: _decibel_of(rows, key) for key in ("psnr_db", "expected_db")}
 
 
 def _row(capture: Capture, found: TargetEstimate) -> dict[str, Any]:
@@ -315,6 +345,7 @@ def _row(capture: Capture, found: TargetEstimate) -> dict[str, Any]:
         "capture": capture.name,
         "psnr_db": target_psnr(capture, torch.from_numpy(found.image), size, motion),
         "expected_db": round(canvas_decibel(found.expected_error, found.plane, seen), 2),
+        "level": _level(capture, torch.from_numpy(found.image), found.plane),
     }
     if capture.target is not None:
         truth = capture.target.rasterise(found.plane)
@@ -332,37 +363,16 @@ def _row(capture: Capture, found: TargetEstimate) -> dict[str, Any]:
     return row
 
 
-def shares_left(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Return what the setup leaves unexplained of each capture, by most positions, where enough are told."""
-    told = sorted((row for row in rows if row.get("unexplained") is not None), key=lambda row: row["positions"])
-    return {row["capture"]: row["unexplained"] for row in told}
-
-
-def sequence_doubts(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return why images are not to be believed, a line each."""
-    return [
-        f"{name}: the setup leaves {100 * share:.0f} % of the light unexplained beside the noise, right ones 1 "
-        "to 3 %: do not believe the image; calibrate this very setup (`evnlos calibrate`)"
-        for name, share in shares_left(rows).items()
-        if share > _MOST_LEFT
-    ] + [
-        f"{row['capture']}: the events fit the setup only with thresholds {row['threshold_factors']} times its "
-        "own; do not believe the image, calibrate pixel and optics on this sensor"
-        for row in rows
-        if any(abs(factor - 1) > _FURTHEST for factor in row.get("threshold_factors", ()))
-    ]
-
-
 def sequence_text(found: dict[str, Any]) -> str:
     """Return the figures as lines for people."""
     is_learned = "open_share" in found["rows"][0]
-    lines = [f"{'capture':12}{'PSNR':>9}{'expected':>10}{'in 90 %':>9}{'crossing':>10}{'noise':>7}{'CPU':>8}"]
-    lines[0] += f"{'open':>7}" if is_learned else ""
+    first = f"{'capture':12}{'PSNR':>9}{'expected':>10}{'in 90 %':>9}{'crossing':>10}{'noise':>7}{'CPU':>8}"
+    lines = [first + (f"{'open':>7}" if is_learned else "")]
     for row in found["rows"]:
         psnr = "-" if row["psnr_db"] is None else f"{row['psnr_db']:.2f}"
-        covered = f"{100 * row['covered_90']:.0f} %" if "covered_90" in row else "-"
-        crossing = f"{100 * row['crossing_noise']:.1f} %" if "crossing_noise" in row else "-"
-        share = f"{100 * row['noise_share']:.0f} %" if "noise_share" in row else "-"
+        covered = f"{100 * np.mean(row['covered_90']):.0f} %" if "covered_90" in row else "-"
+        crossing = f"{100 * np.mean(row['crossing_noise']):.1f} %" if "crossing_noise" in row else "-"
+        share = f"{100 * np.mean(row['noise_share']):.0f} %" if "noise_share" in row else "-"
         lines.append(
             f"{row['capture']:12}{psnr:>9}{row['expected_db']:>10.2f}{covered:>9}{crossing:>10}{share:>7}"
             f"{row['seconds']:>6.1f} s" + (f"{100 * row['open_share']:>5.0f} %" if is_learned else "")

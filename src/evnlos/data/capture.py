@@ -389,8 +389,8 @@ def _write(
 def _digest_of(path: Path, info: CaptureInfo) -> str:
     """Return the hash of a description and of the sizes of its files; streams count where they are named."""
     values, folder = to_dict(info), path if path.is_dir() else path.parent
-    later = {"": ("events_topic", "frames_topic", "recording"), "camera": ("mosaic", "colour", "white_balance")}
-    for place, key in [(values.get(part, values), key) for part, keys in later.items() for key in keys]:
+    later = {"": "events_topic frames_topic recording", "camera": "mosaic colour white_balance event_mosaic"}
+    for place, key in [(values.get(part, values), key) for part, keys in later.items() for key in keys.split()]:
         if place[key] is None:  # as captures had it before there was such a key
             del place[key]
     named = [folder / name for name in (info.events, info.frames, info.target and info.target.mask) if name]

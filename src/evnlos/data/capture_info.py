@@ -41,7 +41,9 @@ class CameraInfo:
     colour: Colour | None = None
     """Colour of the frames and of the target's image that is used; null is all of them, as grey."""
     white_balance: tuple[float, float, float] | None = None
-    """Red, green and blue of a white target in the frames, up to a factor; null is alike."""
+    """Red, green and blue of a white target behind the filters, up to a factor; null is alike."""
+    event_mosaic: Mosaic | None = None
+    """Colour filters on the pixels of the event camera, as `mosaic`; null where each sees all of the light."""
 
     def __post_init__(self) -> None:
         sides = f"camera is {self.width} x {self.height} pixels"
@@ -260,6 +262,8 @@ class CaptureInfo:
     def __post_init__(self) -> None:
         if self.events is None and self.frames is None:
             raise ConfigError("events and frames are null; state one of them")
+        if self.events is None and self.camera.event_mosaic is not None:
+            raise ConfigError("camera.event_mosaic is of the events, and events is null; leave it out")
         if self.every is not None and not 1 <= self.every <= _MOST_EVERY:
             raise ConfigError(f"every is {self.every}; give 1 (all rows and columns) to {_MOST_EVERY}")
         if self.events is None and self.alignment != AlignmentInfo():

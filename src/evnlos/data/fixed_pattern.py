@@ -11,22 +11,23 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from evnlos.cameras import colour_filters
 from evnlos.data.capture_info import CaptureInfo, inside
 from evnlos.data.frames import FrameSeries, map_points, read_image
 from evnlos.data.sampling import frame_homography, reduce_by_area
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from evnlos.events import FrameStack, crop_events, stride_for, thin_events
 from evnlos.files import write_atomically
 from evnlos.setups import Setup
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
-from evnlos.types import Events
+from evnlos.types import COLOURS, Colour, Events
 from evnlos.untrusted import check_memory
 
 
@@ -172,6 +173,11 @@ def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tupl
 _MANY_PIXELS, _ENOUGH_PIXELS = 300_000, 40_000
 
 
+def _stride(info: CaptureInfo, pixels: int) -> int:
+    """Return of which so many rows and columns of a region of some pixels one is used."""
+    return info.every or (stride_for(pixels, _ENOUGH_PIXELS) if pixels > _MANY_PIXELS else 1)
+
+
 def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events, Any, list[str]]:
     """Return events and frames of what is used of the sensor: a region, and every so many pixels of it.
 
@@ -183,9 +189,7 @@ def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events,
         events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
         frames = mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
         notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
-    pixels = events.width * events.height
-    usual = stride_for(pixels, _ENOUGH_PIXELS) if pixels > _MANY_PIXELS else 1
-    if (side := info.every or usual) > 1:
+    if (side := _stride(info, events.width * events.height)) > 1:
         rows, columns = (length // side for length in events.shape)
         if not rows or not columns:
             raise DataError(f"every is {side}, and {events.width} x {events.height} pixels are used; give less")
@@ -199,6 +203,35 @@ def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events,
         frames = mapped(frames, binned)
         notes.append(f"every {side} rows and columns: {columns} x {rows} pixels")
     return events, frames, notes
+
+
+def own_pixels(info: CaptureInfo, colour: Colour, kind: Literal["frames", "events"]) -> NDArray[np.bool_]:
+    """Return which of the used pixels see a colour by themselves, bool [H, W].
+
+    Of frames behind a mosaic all others are interpolated: they share noise with these and tell nothing more.
+    Registered, turned or averaged frames have no such pixels; there one of four (of two for green) is taken.
+
+    Args:
+        info: What is known about the capture.
+        colour: The colour.
+        kind: Pixels of which camera; whole coloured frames have the colour everywhere.
+
+    Raises:
+        ConfigError: The event camera has no filters, or none of every so many pixels has this one.
+    """
+    camera, seen = info.camera, np.ones((info.camera.height, info.camera.width), np.bool_)
+    if (mosaic := camera.mosaic if kind == "frames" else camera.event_mosaic) is not None:
+        seen = colour_filters(mosaic, seen.shape)[COLOURS.index(colour)]
+    elif kind == "events":
+        raise ConfigError("its events are grey; leave --colours or --from, or state camera.event_mosaic")
+    if (roi := info.roi) is not None:
+        seen = seen[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width]
+    if (side := _stride(info, seen.size)) > 1:
+        rows, columns = (length // side * side for length in seen.shape)
+        seen = seen[side // 2 : rows : side, side // 2 : columns : side]
+    if not seen.any():
+        raise ConfigError(f"no pixel for {colour} among every {side} rows and columns; state an odd `every`")
+    return seen
 
 
 def unlike_neighbours(frames: NDArray) -> float:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
@@ -31,7 +32,7 @@ from evnlos.scene import FontGlyphs, Glyphs, LineMotion, OtherTarget, Scene, Sev
 from evnlos.scene.fonts import find_font
 from evnlos.setups import RadiometricSetup, Setup, named_setup, setup_preset
 from evnlos.setups.load import is_name
-from evnlos.types import COLOURS, LUMA_601, Mosaic, derive_seed
+from evnlos.types import COLOURS, LUMA_601, Irradiance, Mosaic, derive_seed
 
 _PUBLISHED_GAIN = {"near": 1.7, "far": 1.0}  # white levels of the brightest pixel
 
@@ -76,6 +77,7 @@ _CAMERAS = {
 }
 
 _SKETCH = (6, 10)  # pixels
+_WAVELENGTHS_M = 650e-9, 550e-9, 450e-9  # of `COLOURS`
 
 
 def in_the_lab(setup: Setup) -> Setup:
@@ -110,11 +112,13 @@ class Lab:
     """Seed of every draw, the sensor's own settings among them."""
     palette: tuple[str, ...] = ()
     """Colours of each object in bands from its top, RRGGBB, hexadecimal shares of white light; with any, frames
-    are in colour, and events of the luma."""
+    are in colour, and events of the luma unless there is an `event_mosaic`."""
     mosaic: Mosaic | None = None
     """Colour filters of the frame camera; without them each pixel of a coloured frame sees all colours."""
+    event_mosaic: Mosaic | None = None
+    """Colour filters of the event camera; without them each pixel sees the luma."""
     white_balance: tuple[float, float, float] = (0.8, 1.0, 0.6)
-    """What coloured frames have of white: red, green and blue, up to a factor."""
+    """What colour filters let through of white: red, green and blue, up to a factor."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):
@@ -311,22 +315,37 @@ def _in_light(lab: Lab, scene: Scene | SeveralTargets, weights: ArrayLike) -> Sc
     return replace(scene, scenes=shown) if isinstance(scene, SeveralTargets) else shown[0]
 
 
-_WAVELENGTHS_M = 650e-9, 550e-9, 450e-9  # of `COLOURS`
-
-
-def _coloured(
-    lab: Lab, scene: Scene | SeveralTargets, times_s: NDArray[np.float64], seed: int
-) -> NDArray[np.uint8]:
-    """Return frames [N, H, W, 3], or [N, H, W] behind a mosaic: one exposure per colour."""
-    pictures, whites = [], balances(lab.white_balance)
-    for k, colour in enumerate(COLOURS):
-        light = {"gain": lab.setup.gain * whites[k], "ambient": lab.setup.ambient * whites[k]}
+def _coloured_walls(lab: Lab, scene: Scene | SeveralTargets) -> list[Irradiance]:
+    """Return the wall behind a filter of each of `COLOURS`."""
+    walls = []
+    for k, white in enumerate(balances(lab.white_balance)):
+        light = {"gain": lab.setup.gain * white, "ambient": lab.setup.ambient * white}
         if hasattr(lab.setup, "wavelength_m"):
             light["wavelength_m"] = _WAVELENGTHS_M[k]
-        wall = replace(lab.setup, **light).observe_all(_in_light(lab, scene, np.eye(3)[k]))
-        pictures.append(lab.setup.frame_camera.capture(wall, times_s, seed=derive_seed(seed, colour)))
-    stacked = np.stack(pictures, axis=-1)
+        walls.append(replace(lab.setup, **light).observe_all(_in_light(lab, scene, np.eye(3)[k])))
+    return walls
+
+
+def _frames(lab: Lab, walls: list[Irradiance], times_s: NDArray[np.float64], seed: int) -> NDArray:
+    """Return frames [N, H, W] of one wall or behind a mosaic, or [N, H, W, 3]: one exposure per colour."""
+    capture = lab.setup.frame_camera.capture
+    if len(walls) == 1:
+        return capture(walls[0], times_s, seed=seed)
+    named = zip(COLOURS, walls, strict=True)
+    stacked = np.stack([capture(one, times_s, seed=derive_seed(seed, name)) for name, one in named], axis=-1)
     return stacked if lab.mosaic is None else mosaicked(stacked, lab.mosaic)
+
+
+class _FilteredWall:
+    """The light of three walls, one a colour, behind Bayer filters: each pixel sees that of its own."""
+
+    def __init__(self, walls: list[Irradiance], mosaic: Mosaic) -> None:
+        self.walls, self.shape, self.speed_px_s = walls, walls[0].shape, max(one.speed_px_s for one in walls)
+        self.mosaic: Mosaic = mosaic
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        light = torch.stack([one.irradiance(t_s) for one in self.walls], dim=-1)
+        return torch.from_numpy(mosaicked(light.numpy(), self.mosaic))
 
 
 def _render(task: tuple[Lab, str, Path]) -> Path:
@@ -336,12 +355,10 @@ def _render(task: tuple[Lab, str, Path]) -> Path:
     wall = lab.setup.observe_all(_in_light(lab, scene, np.array(LUMA_601) / sum(LUMA_601)))
     times_s = np.arange(round(lab.duration_s * lab.frame_rate_hz) + 1) / lab.frame_rate_hz
     seed = derive_seed(lab.seed, name)
-    events = lab.setup.event_camera.record(wall, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
-    of_frames = derive_seed(seed, "frames")
-    if lab.is_coloured:
-        frames = _coloured(lab, scene, times_s, of_frames)
-    else:
-        frames = lab.setup.frame_camera.capture(wall, times_s, seed=of_frames)
+    walls = _coloured_walls(lab, scene) if lab.is_coloured or lab.event_mosaic else []
+    seen = _FilteredWall(walls, lab.event_mosaic) if lab.event_mosaic else wall
+    events = lab.setup.event_camera.record(seen, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
+    frames = _frames(lab, walls if lab.is_coloured else [wall], times_s, derive_seed(seed, "frames"))
     with new_folder(folder) as draft:
         (draft / "frames").mkdir()
         write_events(draft / "events.raw", events)
@@ -368,8 +385,8 @@ def _description(lab: Lab, name: str, scene: Scene | SeveralTargets) -> dict[str
             "height": setup.sensor.height,
             "frame_rate_hz": lab.frame_rate_hz,
             "exposure_s": setup.frame_camera.exposure_s,
-            **({} if lab.mosaic is None else {"mosaic": lab.mosaic}),
-            **({"white_balance": list(lab.white_balance)} if lab.is_coloured else {}),
+            **{key: one for key in ("mosaic", "event_mosaic") if (one := getattr(lab, key))},
+            **({"white_balance": list(lab.white_balance)} if lab.is_coloured or lab.event_mosaic else {}),
         },
         "events": "events.raw",
         "frames": "frames.csv",
