@@ -130,7 +130,7 @@ def test_the_command_prints_tables_and_draws_them(records, apart, monkeypatch, c
     main(["experiment", "captures", *options, "--modalities", "fusion"])
     assert [(study.setup, study.test, study.modalities) for study in asked] == [("lab", ("4",), ("fusion",))]
     said = capsys.readouterr().out
-    assert "| EPNP - strongest E2E |" in said and "best linear estimate, lab" in said
+    assert "| sees | strongest E2E |" in said and "best linear estimate, lab" in said
     assert (apart.out / "captures-lab-test.md").read_text() == said.removesuffix("\n")
     with Image.open(apart.out / "captures-lab-test.png") as drawn:
         assert min(drawn.size) > 200
@@ -493,7 +493,8 @@ def test_tables_say_what_the_records_say(tmp_path) -> None:
     assert "| G |" in character_table(again, ("E2E", "EPNP")) and "**23.10**" in character_table(
         again, ("E2E", "EPNP")
     )
-    assert f"| frame | E2E | {gain} |" in gain_table(again)
+    table = gain_table(again)
+    assert f"| frame | E2E | {e2e:.2f} | {e2e + gain.mean:.2f} | {gain} |" in table
     assert "| E2E frame | 50 % |" in checks_table(again)
 
 

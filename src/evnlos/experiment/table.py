@@ -258,10 +258,8 @@ def summary_table(records: list[Record], metric: str = "psnr_db") -> str:
         if not any(name in r.baselines for r in records):
             continue
         cells = []
-        for modality in modalities:
-            values = [
-                r.baselines[name][metric] for r in records if r.modality == modality and name in r.baselines
-            ]
+        for seen in modalities:
+            values = [r.baselines[name][metric] for r in records if r.modality == seen and name in r.baselines]
             cells.append(f"{np.mean(list(values[-1].values())):.{digits}f}" if values else "")
         lines.append(f"| {title} | {' | '.join(cells)} |")
     for arm in dict.fromkeys(key[0] for key in means):
@@ -306,15 +304,18 @@ def gains_over_e2e(records: list[Record], arm: str = "EPNP") -> dict[str, tuple[
 
 
 def gain_table(records: list[Record], arm: str = "EPNP") -> str:
-    """Return Markdown: `gains_over_e2e`, with 95 % intervals.
+    """Return Markdown: `gains_over_e2e`, with 95 % intervals, and PSNR.
 
     Args:
         records: Records of a study.
         arm: Name of the arm.
     """
-    lines = [f"| {arm} - strongest E2E | which | dB, 95 % interval |", "|---|---|---|"]
-    found = gains_over_e2e(records, arm)
-    return "\n".join([*lines, *(f"| {seen} | {best} | {gain} |" for seen, (best, gain) in found.items())])
+    means = means_of([r for r in records if r.seed >= 0])
+    lines = [f"| sees | strongest E2E | its PSNR, dB | {arm} | {arm} - E2E, 95 % interval |", "|---" * 5 + "|"]
+    for seen, (best, gain) in gains_over_e2e(records, arm).items():
+        own, other = (f"{np.mean(means[name, seen]):.2f}" for name in (arm, best))
+        lines.append(f"| {seen} | {best} | {other} | {own} | {gain} |")
+    return "\n".join(lines)
 
 
 def checks_table(records: list[Record]) -> str:
