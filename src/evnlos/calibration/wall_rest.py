@@ -286,7 +286,7 @@ def uneven_wall(
         found = np.array([around(v) for v in right]) / near
         # The neighbours are worth 4 pi width^2 pixels.
         normal += np.diag(prior / (4 * np.pi * width**2))
-        change = np.linalg.solve(normal, found.T[..., None])[..., 0]
+        change = np.asarray(np.linalg.solve(normal, found.T[..., None])[..., 0], np.float64)
         trial = [
             sum(change[:, k, None] * part for k, part in enumerate(basis)) + basis[0] for basis in (own, beyond)
         ]
