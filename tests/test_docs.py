@@ -18,7 +18,7 @@ import evnlos.types
 from evnlos.cli import VERBS
 from evnlos.cli.about import script
 from evnlos.models import RECONSTRUCTORS
-from evnlos.setups import ROOMS
+from evnlos.setups import ROOMS, load_setup
 
 SOURCE = Path(evnlos.__file__).parent
 ROOT = SOURCE.parent.parent
@@ -113,6 +113,8 @@ def test_every_flag_that_a_page_shows_exists() -> None:
             for kind in re.findall(r"--network\.kind (\w+)", command):
                 names = [item.name.replace("_", "-") for item in fields(RECONSTRUCTORS[kind])]
                 known |= {f"--network.{name}" for name in names}
+            for name in re.findall(r"--setup ([a-z][\w-]*) --setup\.", command):
+                known |= {f"--setup.{item.name.replace('_', '-')}" for item in fields(load_setup(name))}
             for flag in re.findall(r"(?<=\s)--[a-z][\w.-]*", command):
                 checked += 1
                 if flag not in known:

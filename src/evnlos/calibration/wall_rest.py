@@ -80,10 +80,10 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
         explained[name] = _share(error, after, floor)
         if _better(best, after):
             texture, best, kept = trial[:, 0], after, [name]
-    wavy, after, shares = uneven_wall(data, other, state, light, away)
+    wavy, after, plain, shares = uneven_wall(data, other, state, light, away)
     explained |= {name: _share(error, squares, floor) for name, squares in shares.items()}
     tilt = np.zeros((len(light), 2))
-    if _better(best, after):
+    if _better(best, after) and _better(plain, after):  # what is not as smooth is the fixed pattern's
         texture, tilt, kept = 1 + wavy[:, 0], wavy[:, 1:], [min(shares, key=lambda name: shares[name].sum())]
     tilts = np.stack([data.image(part, 0.0) for part in tilt.T])
     sensitivity = texture * np.exp(data.monomials() @ state.sensitivity)
@@ -243,7 +243,7 @@ def _smoothed(data: WallData, ratio: Array, precision: Array, smooth: float) -> 
 
 def uneven_wall(
     data: WallData, other: WallData, state: WallState, light: Array, away: Array
-) -> tuple[Array, Array, dict[str, Array]]:
+) -> tuple[Array, Array, Array, dict[str, Array]]:
     """Return how much brighter and how tilted the wall is where each pixel sees it; what that leaves.
 
     Around each pixel the residual is a linear function of three numbers, the relative sensitivity and the
@@ -260,7 +260,7 @@ def uneven_wall(
 
     Returns:
         The three numbers of each pixel [P, 3]; the squares left of each capture held out [C], by light that is
-        computed again; and the same by the linear function, for each width.
+        computed again; the same by sensitivities alone; and by the linear function, for each width.
     """
     from scipy.ndimage import gaussian_filter  # scipy loads slowly
 
@@ -275,7 +275,7 @@ def uneven_wall(
     gram = [[(a * b).sum(axis=1) for b in parts] for a in parts]
     right = [(a * left).sum(axis=1) for a in parts]
     prior = np.mean(left**2) / np.array([_TEXTURE, _TILT, _TILT]) ** 2
-    best, shares = np.zeros((len(light), 3)), dict[str, Array]()
+    best, plain, shares = np.zeros((len(light), 3)), np.zeros(0), dict[str, Array]()
     for width in _TILTED_PX:
 
         def around(values: Array, width: float = width) -> Array:
@@ -292,10 +292,11 @@ def uneven_wall(
         ]
         after = _remaining_error(data, other, *trial)
         if all(after.sum() < squares.sum() for squares in shares.values()):
-            best = change
+            best, alone = change, found[0] / normal[:, 0, 0]
+            plain = _remaining_error(data, other, *(part[0] * (1 + alone[:, None]) for part in both))
         shares[f"tilt and texture smooth over {width:g} pixels"] = after
     again = [state.light(one, tilt=best[:, 1:]) * (1 + best[:, :1]) for one in (data, other)]
-    return best, _remaining_error(data, other, *again), shares
+    return best, _remaining_error(data, other, *again), plain, shares
 
 
 def correction_of(data: WallData, light: Array, other: WallData, away: Array) -> tuple[Array, Array, Array]:
