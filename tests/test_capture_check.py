@@ -58,6 +58,35 @@ def test_light_that_is_wrong_is_named(capture) -> None:
     assert levels(dim)["brightness"] == "bad" and "lengthen" in cures(dim)["brightness"]
 
 
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_bits_that_were_not_scaled_are_named_and_the_line_mends_it(tiny_captures, tmp_path, bits) -> None:
+    folder, white = tmp_path / "one", (1 << bits) - 1
+    shutil.copytree(tiny_captures[0], folder)
+    for path in (folder / "frames").glob("*.png"):
+        levels_16 = np.round(np.asarray(Image.open(path)) * (white / 255)).astype(np.uint16)
+        Image.fromarray(levels_16).save(path)
+    found = {one.what: one for one in check_capture(read_capture(folder))}["white level"]
+    assert found.level == "doubtful" and f"{bits} bits" in found.found and f"white_dn: {white}}}" in found.cure
+    text = (folder / "capture.yaml").read_text()
+    (folder / "capture.yaml").write_text(text.replace("camera:\n", f"camera:\n  white_dn: {white}\n", 1))
+    mended, before = read_capture(folder), read_capture(tiny_captures[0])
+    assert "white level" not in levels(mended)
+    np.testing.assert_allclose(mended.frames / mended.peak, before.frames / before.peak, atol=1 / white)
+    assert any(str(white) in note for note in mended.notes)
+
+
+def test_a_white_level_needs_frames_of_16_bits(tiny_captures, tmp_path, capture) -> None:
+    shutil.copytree(tiny_captures[0], tmp_path / "one")
+    path = tmp_path / "one" / "capture.yaml"
+    path.write_text(path.read_text().replace("camera:\n", "camera:\n  white_dn: 4095\n", 1))
+    with pytest.raises(DataError, match=r"white_dn is 4095, and frames have 8 bits"):
+        read_capture(tmp_path / "one")
+    with pytest.raises(ConfigError, match="256 to 65535"):
+        CameraInfo(8, 8, white_dn=255)
+    scaled = replace(capture, frames=capture.frames.astype(np.uint16) * 16)
+    assert "white level" not in levels(scaled)  # 12 bits that a camera scaled, of a dim wall
+
+
 def test_a_target_that_did_not_move_is_named(capture) -> None:
     draw = np.random.default_rng(0)
     still = (100 + 3 * draw.standard_normal(capture.frames.shape)).astype(np.uint8)

@@ -9,6 +9,7 @@ import itertools
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -83,6 +84,10 @@ def _finding(what: str, good: bool, bearable: bool, found: str, cure: str) -> Fi
 
 def _light(capture: Capture) -> Iterator[Finding]:
     frames, peak = capture.frames, capture.peak
+    if (bits := _unscaled_bits(capture)) is not None:
+        found = f"the largest of 16 bits is {int(frames.max())}: these look like {bits} bits, not scaled"
+        cure = f"state camera: {{white_dn: {(1 << bits) - 1}}} in capture.yaml, beside its other keys"
+        yield Finding("white level", "doubtful", found, cure)
     clipped = float((frames >= peak).mean())
     found = f"{100 * clipped:.2f} % of the frames' pixels are clipped"
     cure = "shorten the exposure, close the aperture, or dim the ambient light"
@@ -101,6 +106,19 @@ def _light(capture: Capture) -> Iterator[Finding]:
             f"state camera.mosaic in capture.yaml, e.g. rggb; it is {capture.info.camera.mosaic or 'left out'}"
         )
         yield Finding("colour filters", "bad", found, cure)
+
+
+def _unscaled_bits(capture: Capture) -> int | None:
+    """Return 10, 12 or 14 where images of 16 bits, as they lie in their files, hold no more than that."""
+    info, frames = capture.info, capture.frames
+    changes = info.dark, info.flat, info.registration, info.camera.mosaic, info.camera.white_dn
+    size = (info.camera.height, info.camera.width) if info.roi is None else (info.roi.height, info.roi.width)
+    is_raw = Path(info.frames or "").suffix in ("", ".csv", ".npy") and frames.shape[1:] == size
+    if frames.dtype != np.uint16 or not is_raw or any(one is not None for one in changes):
+        return None
+    if np.gcd.reduce(np.unique(frames[0])) > 1:  # of fewer bits, but scaled
+        return None
+    return next((bits for bits in (10, 12, 14) if 255 < int(frames.max()) < 1 << bits), None)
 
 
 def _movement(capture: Capture) -> Iterator[Finding]:

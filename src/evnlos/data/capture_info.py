@@ -42,6 +42,8 @@ class CameraInfo:
     """Colour of the frames and of the target's image that is used; null is all of them, as grey."""
     white_balance: tuple[float, float, float] | None = None
     """Red, green and blue of a white target in the frames, up to a factor; null is alike."""
+    white_dn: int | None = None
+    """Digital number of white in files of 16 bits (frames, dark, flat), 4095 for 12 bits; null is 65535."""
 
     def __post_init__(self) -> None:
         sides = f"camera is {self.width} x {self.height} pixels"
@@ -51,6 +53,8 @@ class CameraInfo:
             raise ConfigError(f"{sides}; at most {MOST_SENSOR_PIXELS:,} are read")
         if self.white_balance is not None and not all(0 < one < math.inf for one in self.white_balance):
             raise ConfigError(f"camera.white_balance is {self.white_balance}; give three numbers above 0")
+        if self.white_dn is not None and not 256 <= self.white_dn <= 65_535:
+            raise ConfigError(f"camera.white_dn is {self.white_dn}; give 256 to 65535, of frames of 16 bits")
 
     @property
     def balance(self) -> float:

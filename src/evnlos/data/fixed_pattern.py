@@ -138,12 +138,16 @@ def warp_frames(
 
 def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
     """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
-    frames, notes = series.images, []
+    frames, notes, white = series.images, [], info.camera.white_dn
     size = frames.shape[1:]
-    peak = float(np.iinfo(frames.dtype).max)
+    if white is not None and frames.dtype == np.uint8:
+        raise DataError(f"{folder}: camera.white_dn is {white}, and frames have 8 bits; leave it out")
+    peak = float(white or np.iinfo(frames.dtype).max)
     filters = size, info.camera.colour, info.camera.mosaic
     dark, flat = (read_image(inside(folder, one), *filters) if one else None for one in (info.dark, info.flat))
     is_corrected = dark is not None or flat is not None
+    if white is not None:
+        notes.append(f"frames scaled: white is {white}")
     if is_corrected:
         notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
     if info.frames_turned:
@@ -158,7 +162,7 @@ def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tupl
         notes.append(f"frames registered by {how}; they cover {covered:.0f} % of the events' view")
 
     def prepared(block: NDArray) -> NDArray:
-        changed = correct_frames(block, peak, dark, flat) if is_corrected else None
+        changed = correct_frames(block, peak, dark, flat) if is_corrected or white else None
         if info.frames_turned:
             block = block[:, ::-1, ::-1]
             changed = None if changed is None else changed[:, ::-1, ::-1]
