@@ -14,7 +14,6 @@ from PIL import Image
 from evnlos.cli import main
 from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml
 from evnlos.data import Sampling, SensorSize, capture_samples, read_capture
-from evnlos.data.capture_check import PUBLISHED, compare_published, content_digest
 from evnlos.data.lab import (
     SENSOR_SPREAD,
     Lab,
@@ -26,6 +25,7 @@ from evnlos.data.simulations import default
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.optics import Diffraction
+from evnlos.report.provenance import PUBLISHED, compare_published, content_digest
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, OtherTarget, Scene, SeveralTargets
 from evnlos.setups import PaperSetup, RadiometricSetup, setup_names, setup_preset
 from evnlos.types import Plane

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from evnlos.data import read_capture
-from evnlos.data.capture_check import PUBLISHED, content_digest
+from evnlos.report.provenance import PUBLISHED, content_digest
 
 
 def main() -> None:

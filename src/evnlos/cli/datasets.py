@@ -28,7 +28,7 @@ from evnlos.data import (
     simulate,
 )
 from evnlos.data.capture import by_name
-from evnlos.data.capture_check import Finding, check_capture, compare_clocks, compare_published
+from evnlos.data.capture_check import Finding, check_capture, compare_clocks
 from evnlos.data.capture_info import CAMERAS, CaptureInfo, begin_capture
 from evnlos.data.lab import Lab, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
@@ -177,6 +177,8 @@ class LabCommand:
 
     def run(self) -> None:
         """Render, with a progress bar over the captures; compare a published set with its checksums."""
+        from evnlos.report.provenance import compare_published
+
         lab, record = self.settings, "lab.yaml"
         if self.set is not None:
             lab, record = published_lab(self.set, lab), f"{self.set}.lab.yaml"

@@ -39,6 +39,7 @@ from evnlos.types import Colour, Events, matching_paths
 from evnlos.untrusted import no_file
 
 _HELD_BYTES = 1 << 26  # frames of an import that take more are read as they are asked for
+_LATER_KEYS = "mosaic colour white_balance event_mosaic white_dn"  # of camera, in no capture of before
 _MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
 
 
@@ -389,12 +390,11 @@ def _write(
 def _digest_of(path: Path, info: CaptureInfo) -> str:
     """Return the hash of a description and of the sizes of its files; streams count where they are named."""
     values, folder = to_dict(info), path if path.is_dir() else path.parent
-    later = {"": "events_topic frames_topic recording", "camera": "mosaic colour white_balance event_mosaic"}
-    for place, key in [(values.get(part, values), key) for part, keys in later.items() for key in keys.split()]:
+    later = ((values, "events_topic frames_topic recording"), (values["camera"], _LATER_KEYS))
+    for place, key in [(place, key) for place, keys in later for key in keys.split()]:
         if place[key] is None:  # as captures had it before there was such a key
             del place[key]
     named = [folder / name for name in (info.events, info.frames, info.target and info.target.mask) if name]
     files = [one for there in named for one in (sorted(there.glob("*")) if there.is_dir() else [there])]
     own = [one for one in files if one.is_file() and one.resolve().is_relative_to(folder.resolve())]
-    values["bytes"] = [one.stat().st_size for one in own]
-    return config_hash(values)
+    return config_hash(values | {"bytes": [one.stat().st_size for one in own]})

@@ -1,12 +1,10 @@
 """Is a capture worth a day of recordings? What was recorded, in plain words, and how to mend it.
 
 - Of several captures by one camera: whose clocks differ from the others'?
-- Of published captures: are they the published ones?
 """
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -16,16 +14,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from evnlos.config import read_yaml
-from evnlos.data.capture import Capture, read_capture
+from evnlos.data.capture import Capture
 from evnlos.data.capture_info import CaptureInfo
 from evnlos.data.clocks import FEWEST_LAGS, LEAST_AGREEMENT, beside_others, find_lag
 from evnlos.data.fixed_pattern import light_path, unlike_neighbours
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import find_hot_pixels
-from evnlos.events.cleaning import find_flicker
-from evnlos.machine import Progress, Step, silent
+from evnlos.events.cleaning import find_flicker, share_of_lamps
 from evnlos.types import Events
 
 Level = Literal["good", "doubtful", "bad"]
@@ -37,6 +33,7 @@ _SURELY = 1.5  # times what is usual
 _CLEARLY = 1.2  # times the agreement of frames and events
 _FAR_M = 0.5  # behind that little light of a target reaches what a camera sees of the wall
 _WEAK_FLICKER = 0.15  # of the rate: what little lamps sway
+_FEW_OF_LAMPS = 0.03  # of the events: a ripple below the thresholds makes less than a hundredth
 _USUAL_EVENTS, _FEW_HOLES = 100, 0.05  # events between two frames of which none is no chance; share of them
 _MOSAIC = 0.03  # by which the diagonals of 2 x 2 pixels differ: smooth light and a pattern make far less
 
@@ -87,6 +84,10 @@ def _finding(what: str, good: bool, bearable: bool, found: str, cure: str) -> Fi
 
 def _light(capture: Capture) -> Iterator[Finding]:
     frames, peak = capture.frames, capture.peak
+    if (bits := _unscaled_bits(capture)) is not None:
+        found = f"the largest of 16 bits is {int(frames.max())}: these look like {bits} bits, not scaled"
+        cure = f"state camera: {{white_dn: {(1 << bits) - 1}}} in capture.yaml, beside its other keys"
+        yield Finding("white level", "doubtful", found, cure)
     clipped = float((frames >= peak).mean())
     found = f"{100 * clipped:.2f} % of the frames' pixels are clipped"
     cure = "shorten the exposure, close the aperture, or dim the ambient light"
@@ -105,6 +106,19 @@ def _light(capture: Capture) -> Iterator[Finding]:
             f"state camera.mosaic in capture.yaml, e.g. rggb; it is {capture.info.camera.mosaic or 'left out'}"
         )
         yield Finding("colour filters", "bad", found, cure)
+
+
+def _unscaled_bits(capture: Capture) -> int | None:
+    """Return 10, 12 or 14 where images of 16 bits, as they lie in their files, hold no more than that."""
+    info, frames = capture.info, capture.frames
+    changes = info.dark, info.flat, info.registration, info.camera.mosaic, info.camera.white_dn
+    size = (info.camera.height, info.camera.width) if info.roi is None else (info.roi.height, info.roi.width)
+    is_raw = Path(info.frames or "").suffix in ("", ".csv", ".npy") and frames.shape[1:] == size
+    if frames.dtype != np.uint16 or not is_raw or any(one is not None for one in changes):
+        return None
+    if np.gcd.reduce(np.unique(frames[0])) > 1:  # of fewer bits, but scaled
+        return None
+    return next((bits for bits in (10, 12, 14) if 255 < int(frames.max()) < 1 << bits), None)
 
 
 def _movement(capture: Capture) -> Iterator[Finding]:
@@ -201,25 +215,46 @@ def _events(capture: Capture) -> Iterator[Finding]:
 
 
 def _flicker(capture: Capture) -> Iterator[Finding]:
-    """Look for a line near twice the mains' frequency in the rate of events."""
+    """Look for a line near twice the mains' frequency in the rate of events, and for events of the lamps."""
     events = capture.events
     line = find_flicker(events) if len(events) >= _FEWEST_EVENTS else None
     if line is None:
         text = f"{len(events)} events are too few or too short to tell"
         yield Finding("flicker", "doubtful", text, "record longer")
         return
-    phase = 2 * np.pi * line.frequency_hz * 1e-6 * (events.t_us - events.t_us[0])
+    hertz, phase = line.frequency_hz, 2 * np.pi * line.frequency_hz * 1e-6 * (events.t_us - events.t_us[0])
     both = [phase[events.p == kind] for kind in (False, True)]
     depth = max(2 * abs(np.exp(1j * one).mean()) for one in both if len(one))
-    yield _finding(
-        "flicker",
-        not line.is_there or depth < _WEAK_FLICKER,
-        line.strength < 10 * line.limit or depth < 2 * _WEAK_FLICKER,
-        f"the rate's line at {line.frequency_hz:.1f} Hz is {line.strength:.0f} times its surroundings "
-        f"({line.limit:.0f} is safe) and sways it by {100 * depth:.0f} % ({100 * _WEAK_FLICKER:.0f} % is safe)",
-        "light with direct current or daylight: mains lamps flicker; filters: {flicker_hz: "
-        f"{line.frequency_hz:.2f}}} in capture.yaml takes their events away",
+    found = (
+        f"the rate's line at {hertz:.1f} Hz is {line.strength:.0f} times its surroundings "
+        f"({line.limit:.0f} is safe) and sways it by {100 * depth:.0f} % ({100 * _WEAK_FLICKER:.0f} % is safe)"
     )
+    direct = "light with direct current or daylight: mains lamps flicker"
+    if not line.is_there or depth < _WEAK_FLICKER:
+        yield Finding("flicker", "good", found)
+        return
+    own, taken = share_of_lamps(events, hertz)
+    own = own if all(map(len, both)) else 1.0  # one polarity does not tell whose events they are
+    least = f"{100 * _FEW_OF_LAMPS:.0f} % is safe"
+    if own < _FEW_OF_LAMPS:
+        step_us = float(np.median(np.diff(capture.frame_times_us)))
+        is_short = 4e6 / hertz < step_us
+        found = (
+            f"lamps at {hertz:.1f} Hz time events and make {100 * own:.1f} % of them ({least}): their ripple "
+            f"is below the thresholds. It moves an event by up to {1e3 / hertz:.0f} ms, which no filter mends "
+            f"and {'does no harm to' if is_short else 'matters in'} time steps of {1e-3 * step_us:.0f} ms"
+        )
+        yield _finding("flicker", is_short, True, found, direct)
+        return
+    stated = capture.info.filters.flicker_hz
+    way = (
+        f"filters: {{flicker_hz: {hertz:.2f}}} in capture.yaml{'' if stated is None else f', not {stated:g},'}"
+    )
+    if taken < 0.5 * own:
+        way = "the filter flicker_hz, which looks for pixels that turn in each period,"
+    is_weak = own < 5 * _FEW_OF_LAMPS or line.strength < 10 * line.limit or depth < 2 * _WEAK_FLICKER
+    found += f"; the lamps make {100 * own:.0f} % of the events ({least})"
+    yield _finding("flicker", False, is_weak, found, f"{direct}; {way} takes {100 * taken:.0f} % of them away")
 
 
 def _clock(capture: Capture) -> Iterator[Finding]:
@@ -343,56 +378,3 @@ def _offset_cure(info: CaptureInfo, lag_us: int) -> str:
     if stated == "auto":
         return f"auto went astray: state offset_us in capture.yaml, what auto found {lag_us:+d}"
     return f"state alignment: {{offset_us: {stated + lag_us}}} in capture.yaml, or wire a trigger_channel"
-
-
-PUBLISHED = Path(__file__).with_name("published_captures.yaml")
-"""For each published set: character -> SHA-256 of its capture's content, and its number of events."""
-_ROUNDING = 0.01  # share of the events by which processors and versions of libraries may differ
-
-
-def content_digest(capture: Capture) -> str:
-    """Return the SHA-256 of what a capture holds: events, frames and their times, and the target's mask.
-
-    How the files are packed has no part in it, nor has `capture.yaml`.
-    """
-    found, events = hashlib.sha256(), capture.events
-    mask = b"" if capture.target is None else np.round(capture.target.mask * 255).astype(np.uint8)
-    for values in (
-        np.asarray(events.t_us, "<i8"),
-        np.asarray(events.x, "<u2"),
-        np.asarray(events.y, "<u2"),
-        np.asarray(events.p, np.uint8),
-        np.asarray(capture.frame_times_us, "<i8"),
-        capture.frames,
-        mask,
-    ):
-        found.update(np.ascontiguousarray(values).tobytes() if isinstance(values, np.ndarray) else values)
-    return found.hexdigest()
-
-
-def compare_published(name: str, folders: list[Path], progress: Progress = silent) -> dict[str, str]:
-    """Compare captures with the published ones, and return what differs, a line for each capture that does.
-
-    Args:
-        name: Set, as for `published_lab`.
-        folders: Capture folders of the set.
-        progress: Called as each is read.
-
-    Raises:
-        DataError: A capture is another one: its number of events is more than a hundredth off.
-    """
-    listed, differing = read_yaml(PUBLISHED)[name], dict[str, str]()
-    for done, folder in enumerate(folders):
-        progress(Step(f"compare {name}", done, len(folders), "captures", folder))
-        digest, events = listed[folder.name.removeprefix(f"{name}_")]
-        capture = read_capture(folder)
-        count = len(capture.events)
-        if abs(count - events) > _ROUNDING * events:
-            raise DataError(
-                f"{folder} holds {count:,} events, the published one {events:,}; it is another capture: "
-                "delete it and render it again"
-            )
-        if content_digest(capture) != digest:
-            differing[folder.name] = f"{count:,} events, published {events:,}"
-    progress(Step(f"compare {name}", len(folders), len(folders), "captures"))
-    return differing

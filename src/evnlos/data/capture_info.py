@@ -36,14 +36,15 @@ class CameraInfo:
     clock_mhz: int | None = None
     """Clock of a CeleX-V sensor, MHz, where the file's name does not say it."""
     mosaic: Mosaic | None = None
-    """Colour filters on the pixels of the frame camera, whose files hold raw values: the colours of two pixels
-    of the first row, then of the second; null for files of grey or whole coloured pixels."""
+    """Colour filters of the frame camera, whose files are raw: two pixels of the first row, two below."""
     colour: Colour | None = None
     """Colour of the frames and of the target's image that is used; null is all of them, as grey."""
     white_balance: tuple[float, float, float] | None = None
     """Red, green and blue of a white target behind the filters, up to a factor; null is alike."""
     event_mosaic: Mosaic | None = None
     """Colour filters on the pixels of the event camera, as `mosaic`; null where each sees all of the light."""
+    white_dn: int | None = None
+    """Digital number of white in files of 16 bits (frames, dark, flat), 4095 for 12 bits; null is 65535."""
 
     def __post_init__(self) -> None:
         sides = f"camera is {self.width} x {self.height} pixels"
@@ -53,6 +54,8 @@ class CameraInfo:
             raise ConfigError(f"{sides}; at most {MOST_SENSOR_PIXELS:,} are read")
         if self.white_balance is not None and not all(0 < one < math.inf for one in self.white_balance):
             raise ConfigError(f"camera.white_balance is {self.white_balance}; give three numbers above 0")
+        if self.white_dn is not None and not 256 <= self.white_dn <= 65_535:
+            raise ConfigError(f"camera.white_dn is {self.white_dn}; give 256 to 65535, of frames of 16 bits")
 
     @property
     def balance(self) -> float:
@@ -64,8 +67,7 @@ class CameraInfo:
 
 def balances(white: tuple[float, float, float]) -> list[float]:
     """Return red, green and blue of a white target over its grey, from those up to a factor."""
-    grey = sum(share * one for share, one in zip(LUMA_601, white, strict=True)) / sum(LUMA_601)
-    return [one / grey for one in white]
+    return [one * sum(LUMA_601) / sum(map(math.prod, zip(LUMA_601, white, strict=True))) for one in white]
 
 
 @dataclass(frozen=True)
@@ -180,8 +182,7 @@ class FilterInfo:
     flicker_hz: float | None = None
     """Frequency of flickering light, hertz: twice that of the mains; none = keep its events."""
     background_us: int | None = None
-    """Events to which fewer than 2 of the 4 pixels beside sent one of that polarity so near in time are noise,
-    microseconds; none = keep all."""
+    """Events without 2 of that polarity from 4 pixels beside so near are noise, microseconds; none = keep."""
 
 
 @dataclass(frozen=True)
@@ -223,9 +224,8 @@ class CaptureInfo:
     events: str | None = "events.raw"
     """The event file, as the camera wrote it; null for a frame camera alone."""
     frames: str | None = "frames.csv"
-    """Frames: a table t_us,file; a video; a folder of images; an AEDAT file or ROS bag, also the same file as
-    `events`; a CeleX-V recording of mode F; null for an event camera alone, whose time steps are then at
-    `camera.frame_rate_hz` (30 Hz by default)."""
+    """Frames: a table t_us,file; a video; a folder of images; an AEDAT file or ROS bag, also that of `events`;
+    a CeleX-V recording of mode F; null without any: time steps are then at `camera.frame_rate_hz` (30 Hz)."""
     events_topic: str | None = None
     """Stream of the event file, where it holds several (topics of a ROS bag); `evnlos info` lists them."""
     frames_topic: str | None = None

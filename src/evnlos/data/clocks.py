@@ -220,6 +220,7 @@ _MOST_FRAMES, _MOST_BINS, _FINEST_BIN_US = 400, 4_000, 5_000
 _LAGS = 201
 _LOBE, _SHARE_OF_LOBE, _SENSORS_SHARE = 0.9, 0.1, 0.05
 _NEARLY = 0.7  # of the best threshold's agreement: low thresholds agree best whatever the sensor's is
+_LIKELY = 0.85  # of the agreement of even thresholds: uneven ones that reach it are as likely
 _FEWEST_FRAMES = 6
 _USUAL_US = 20_000
 FEWEST_LAGS = 8
@@ -234,8 +235,8 @@ class ClockLag:
     Args:
         lag_us: What to add to the frames' times, microseconds.
         limit_us: What is usual where the clocks agree, microseconds: the largest of half a time between frames
-            (a whole one where one polarity alone tells it, from one flank of the light), a tenth of the lobe's
-            width, and half of what the lag differs by between likely thresholds.
+            (a whole one where one polarity tells it alone, from one flank), a tenth of the lobe's width,
+            and half of what the lag differs by between likely thresholds.
         unsure_us: What slow pixels (late) or noisy ones (early) make at most by themselves, so that it can't be
             told from clocks that differ, microseconds: a twentieth of the lobe's width more.
         agreement: Correlation at that lag, -1..1.
@@ -267,7 +268,8 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
     sent, so that the lateness is on both sides. The lag is the middle of the lobe's top, a mean over those of
     four thresholds that agree nearly as well as the best one: a threshold too high makes it too early, one too
     low too late. Where one polarity is much the more frequent, either its threshold is the lower one by that
-    ratio, or noise and leak send the surplus; what agrees better counts.
+    ratio, or noise and leak send the surplus: what agrees better counts, but even thresholds, which agree well
+    with any sensor, count alone only where they do so clearly.
 
     Args:
         events: The events.
@@ -300,14 +302,15 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
         pairs = [(lower * ratio_on, lower * ratio_off) for lower in _THRESHOLDS]
         curves = [curve(expected_counts(level, *pair)) for pair in pairs]
         courses.append((max(one.max() for one in curves), pairs, curves))
-    top, pairs, curves = max(courses, key=lambda course: course[0])
+    top, pairs, curves = best_of = max(courses, key=lambda course: course[0])
     best = int(np.argmax([one.max() for one in curves]))
     backwards = curve(expected_counts(level[::-1], *pairs[best]))
-    near = [_middle(lags, one) for one in curves if one.max() >= min(_NEARLY * top, top)]
-    lag, width = np.mean(near, axis=0)
-    left_open = 0.5 * float(np.ptp([middle for middle, _ in near]))
+    is_even = best_of is courses[0]
+    likely = [one for one in courses if one[0] >= min(_LIKELY * top, top)] if is_even else [best_of]
+    near = [one for _, _, several in likely for one in several if one.max() >= min(_NEARLY * top, top)]
+    middles, widths = zip(*(_middle(lags, one) for one in near), strict=True)
+    lag, width, left_open = np.mean(middles), np.mean(widths), 0.5 * float(np.ptp(middles))
     between = float(np.median(np.diff(times_us)))
-    is_even = pairs[0][0] == pairs[0][1]
     limit = max((0.5 if is_even else 1.0) * between, _SHARE_OF_LOBE * float(width), left_open)
     unsure = limit + _SENSORS_SHARE * float(width)
     return ClockLag(round(float(lag)), round(limit), round(unsure), float(top), float(backwards.max()))

@@ -36,8 +36,7 @@ def correct_frames(
 ) -> NDArray[np.float32]:
     """Return frames without dark signal and uneven response, 0..1.
 
-    (F - D) / (peak - mean D), divided by (flat - D) / mean(flat - D) where a flat field is given; clipped to
-    0..1.
+    (F - D) / (peak - mean D), divided by (flat - D) / mean(flat - D) where there is a flat field, and clipped.
 
     Args:
         frames: [N, H, W], digital numbers.
@@ -57,9 +56,7 @@ def correct_frames(
         response = np.asarray(flat, np.float32) - ground
         mean = float(response.mean())
         if mean <= 0:
-            raise DataError(
-                f"the flat field is {mean:.1f} brighter than the dark frame; record an evenly lit one"
-            )
+            raise DataError(f"the flat field is {mean:.1f} brighter than the dark frame; record an even one")
         # A dead pixel would become infinite; below a tenth of the mean response nothing can be said.
         out *= np.where(response > 0.1 * mean, mean / np.maximum(response, 0.1 * mean), 0.0)
     return np.clip(out / max(peak - float(ground.mean()), 1.0), 0.0, 1.0)
@@ -107,8 +104,7 @@ def warp_frames(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return frames on another camera's pixels, and how much of each of these the frames cover.
 
-    A pixel is the mean of bilinear samples on a square grid in it, as many as keep them about a source pixel
-    apart (at most 8 x 8), so that a finer camera is averaged and not merely picked from.
+    A pixel is the mean of bilinear samples on a grid in it, about a source pixel apart (at most 8 x 8).
 
     Args:
         frames: [N, H, W], any real numbers; pixel centres are at whole coordinates.
@@ -139,12 +135,16 @@ def warp_frames(
 
 def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
     """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
-    frames, notes = series.images, []
+    frames, notes, white = series.images, [], info.camera.white_dn
     size = frames.shape[1:]
-    peak = float(np.iinfo(frames.dtype).max)
+    if white is not None and frames.dtype == np.uint8:
+        raise DataError(f"{folder}: camera.white_dn is {white}, and frames have 8 bits; leave it out")
+    peak = float(white or np.iinfo(frames.dtype).max)
     filters = size, info.camera.colour, info.camera.mosaic
     dark, flat = (read_image(inside(folder, one), *filters) if one else None for one in (info.dark, info.flat))
     is_corrected = dark is not None or flat is not None
+    if white is not None:
+        notes.append(f"frames scaled: white is {white}")
     if is_corrected:
         notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
     if info.frames_turned:
@@ -159,7 +159,7 @@ def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tupl
         notes.append(f"frames registered by {how}; they cover {covered:.0f} % of the events' view")
 
     def prepared(block: NDArray) -> NDArray:
-        changed = correct_frames(block, peak, dark, flat) if is_corrected else None
+        changed = correct_frames(block, peak, dark, flat) if is_corrected or white else None
         if info.frames_turned:
             block = block[:, ::-1, ::-1]
             changed = None if changed is None else changed[:, ::-1, ::-1]
@@ -208,8 +208,8 @@ def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events,
 def own_pixels(info: CaptureInfo, colour: Colour, kind: Literal["frames", "events"]) -> NDArray[np.bool_]:
     """Return which of the used pixels see a colour by themselves, bool [H, W].
 
-    Of frames behind a mosaic all others are interpolated: they share noise with these and tell nothing more.
-    Registered, turned or averaged frames have no such pixels; there one of four (of two for green) is taken.
+    Behind a mosaic all others of frames are interpolated. Registered, turned or averaged frames have no such
+    pixels; there one of four (of two for green) is taken.
 
     Args:
         info: What is known about the capture.
@@ -217,7 +217,7 @@ def own_pixels(info: CaptureInfo, colour: Colour, kind: Literal["frames", "event
         kind: Pixels of which camera; whole coloured frames have the colour everywhere.
 
     Raises:
-        ConfigError: The event camera has no filters, or none of every so many pixels has this one.
+        ConfigError: The event camera has no filters, or no used pixel has this one.
     """
     camera, seen = info.camera, np.ones((info.camera.height, info.camera.width), np.bool_)
     if (mosaic := camera.mosaic if kind == "frames" else camera.event_mosaic) is not None:

@@ -1,6 +1,6 @@
 """A recording of any length cleaned in two passes: what is wrong with it is found, and what stays is written.
 
-- The frequency of lamps on the mains, from the rate of events.
+- The frequency of lamps on the mains, from the rate of events, and what share of the events they made.
 - Hot pixels and the rate of the background, from the counts of all pixels.
 """
 
@@ -342,6 +342,44 @@ def clean_events(events: Events, options: CleanOptions | None = None) -> tuple[E
     kept = list(cleaner.clean([events]))
     columns = join([piece.columns() for piece in kept]) if kept else events[:0].columns()
     return trusted_events(columns, events.width, events.height), cleaner.report
+
+
+@njit(cache=True)
+def _turns(t_us, x, y, p, newest, gap_us):
+    """Count the events of turns: a pixel's next event has the other polarity; within `gap_us`, and as far on.
+
+    newest: -1 for each pixel, int64 [H, W]; the second count is of turns after 2 to 3 times `gap_us`: chance.
+    """
+    soon, late = np.zeros(len(t_us), np.bool_), np.zeros(len(t_us), np.bool_)
+    for i in range(len(t_us)):
+        k = newest[y[i], x[i]]
+        newest[y[i], x[i]] = i
+        if k >= 0 and p[k] != p[i]:
+            gap = t_us[i] - t_us[k]
+            if gap <= gap_us:
+                soon[i] = soon[k] = True
+            elif 2 * gap_us < gap <= 3 * gap_us:
+                late[i] = late[k] = True
+    return soon.sum(), late.sum()
+
+
+def share_of_lamps(events: Events, frequency_hz: float) -> tuple[float, float]:
+    """Return what share of the events lamps made, and what share its filter takes away.
+
+    Where a ripple passes the thresholds, pixels turn from ON to OFF or back within a period; the share of such
+    events, less what chance makes, is the lamps' own. A weaker ripple times the events of other light alone.
+
+    Args:
+        events: The stream, one event or more.
+        frequency_hz: Frequency of the light, 1 to 5000 Hz.
+
+    Raises:
+        ConfigError: A frequency outside its range.
+    """
+    taken = clean_events(events, CleanOptions(None, frequency_hz))[1].flicker_events / len(events)
+    newest = np.full(events.shape, -1, np.int64)
+    soon, late = _turns(events.t_us, events.x, events.y, events.p, newest, round(1e6 / frequency_hz))
+    return max(taken, (soon - late) / len(events)), taken
 
 
 def _window_us(counts: NDArray[np.int64], duration_us: int, sides: int) -> int:

@@ -3,24 +3,30 @@
 - The commands that make a report again, and the files of settings that they read.
 - How a report was made: machine and versions, the commands that make it again, all settings.
 - What weights see, how they were trained, and how good they were found to be.
+- Of published captures: are they the published ones?
 """
 
 from __future__ import annotations
 
+import hashlib
 import html
 import platform
 import shlex
 from collections.abc import Iterator
 from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 
-from evnlos.data import Dataset, Sampling
+from evnlos.config import read_yaml
+from evnlos.data import Capture, Dataset, Sampling, read_capture
 from evnlos.data.sampling import SOLVED
-from evnlos.errors import printable
+from evnlos.errors import DataError, printable
+from evnlos.machine import Progress, Step, silent
 from evnlos.models import GENERIC, Weights, describe_network
 from evnlos.registry import __version__
 from evnlos.report.tables import RunResult
@@ -289,3 +295,56 @@ def _score_line(scores: dict[str, Any]) -> str:
         return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
     except (KeyError, TypeError, ValueError, AttributeError):
         return "  its scores are not what this version writes"
+
+
+PUBLISHED = Path(__file__).parents[1] / "data" / "published_captures.yaml"
+"""For each published set: character -> SHA-256 of its capture's content, and its number of events."""
+_ROUNDING = 0.01  # share of the events by which processors and versions of libraries may differ
+
+
+def content_digest(capture: Capture) -> str:
+    """Return the SHA-256 of what a capture holds: events, frames and their times, and the target's mask.
+
+    How the files are packed has no part in it, nor has `capture.yaml`.
+    """
+    found, events = hashlib.sha256(), capture.events
+    mask = b"" if capture.target is None else np.round(capture.target.mask * 255).astype(np.uint8)
+    for values in (
+        np.asarray(events.t_us, "<i8"),
+        np.asarray(events.x, "<u2"),
+        np.asarray(events.y, "<u2"),
+        np.asarray(events.p, np.uint8),
+        np.asarray(capture.frame_times_us, "<i8"),
+        capture.frames,
+        mask,
+    ):
+        found.update(np.ascontiguousarray(values).tobytes() if isinstance(values, np.ndarray) else values)
+    return found.hexdigest()
+
+
+def compare_published(name: str, folders: list[Path], progress: Progress = silent) -> dict[str, str]:
+    """Compare captures with the published ones, and return what differs, a line for each capture that does.
+
+    Args:
+        name: Set, as for `published_lab`.
+        folders: Capture folders of the set.
+        progress: Called as each is read.
+
+    Raises:
+        DataError: A capture is another one: its number of events is more than a hundredth off.
+    """
+    listed, differing = read_yaml(PUBLISHED)[name], dict[str, str]()
+    for done, folder in enumerate(folders):
+        progress(Step(f"compare {name}", done, len(folders), "captures", folder))
+        digest, events = listed[folder.name.removeprefix(f"{name}_")]
+        capture = read_capture(folder)
+        count = len(capture.events)
+        if abs(count - events) > _ROUNDING * events:
+            raise DataError(
+                f"{folder} holds {count:,} events, the published one {events:,}; it is another capture: "
+                "delete it and render it again"
+            )
+        if content_digest(capture) != digest:
+            differing[folder.name] = f"{count:,} events, published {events:,}"
+    progress(Step(f"compare {name}", len(folders), len(folders), "captures"))
+    return differing
