@@ -418,7 +418,7 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     shown = capsys.readouterr().out
     assert "EPNP sequence fusion" in shown and "E2E event" in shown and "report:" in shown
-    assert "EPNP - strongest E2E" in shown and "was not fitted to this setup" in shown
+    assert "| sees | strongest E2E |" in shown and "was not fitted to this setup" in shown
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "Synthetic captures" not in page
     # A second call takes up what is there: nothing is made again, the table is the same. The folder above the
