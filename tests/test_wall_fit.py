@@ -300,7 +300,7 @@ def test_an_uneven_wall_is_found_from_what_it_shifts(rendered):
         for one, light in zip((data, held), seen, strict=True)
     )
     plain = [state.light(one) for one in (own, other)]
-    found, after, textured, shares = uneven_wall(own, other, state, *plain)
+    shares, _, found, after, textured = uneven_wall(own, other, state, *plain)
     bright = plain[0].mean(axis=1) > np.median(plain[0].mean(axis=1))
     for part, true in zip(found.T, (texture - 1, *tilt.T), strict=True):
         assert np.corrcoef(part[bright], true[bright])[0, 1] > 0.8

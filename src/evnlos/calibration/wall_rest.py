@@ -80,11 +80,11 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
         explained[name] = _share(error, after, floor)
         if _better(best, after):
             texture, best, kept = trial[:, 0], after, [name]
-    wavy, after, plain, shares = uneven_wall(data, other, state, light, away)
-    explained |= {name: _share(error, squares, floor) for name, squares in shares.items()}
+    shares, name, wavy, after, plain = uneven_wall(data, other, state, light, away)
+    explained |= {one: _share(error, squares, floor) for one, squares in shares.items()}
     tilt = np.zeros((len(light), 2))
     if _better(best, after) and _better(plain, after):  # what is not as smooth is the fixed pattern's
-        texture, tilt, kept = 1 + wavy[:, 0], wavy[:, 1:], [min(shares, key=lambda name: shares[name].sum())]
+        texture, tilt, kept = 1 + wavy[:, 0], wavy[:, 1:], [name]
     tilts = np.stack([data.image(part, 0.0) for part in tilt.T])
     sensitivity = texture * np.exp(data.monomials() @ state.sensitivity)
 
@@ -243,7 +243,7 @@ def _smoothed(data: WallData, ratio: Array, precision: Array, smooth: float) -> 
 
 def uneven_wall(
     data: WallData, other: WallData, state: WallState, light: Array, away: Array
-) -> tuple[Array, Array, Array, dict[str, Array]]:
+) -> tuple[dict[str, Array], str, Array, Array, Array]:
     """Return how much brighter and how tilted the wall is where each pixel sees it; what that leaves.
 
     Around each pixel the residual is a linear function of three numbers, the relative sensitivity and the
@@ -259,8 +259,9 @@ def uneven_wall(
         away: The model's light of `other`.
 
     Returns:
-        The three numbers of each pixel [P, 3]; the squares left of each capture held out [C], by light that is
-        computed again; the same by sensitivities alone; and by the linear function, for each width.
+        The squares left of each capture held out [C], by the linear function, for each width by name; the best
+        name; its three numbers of each pixel [P, 3]; what they leave by light that is computed again [C]; and
+        what its sensitivities alone leave [C].
     """
     from scipy.ndimage import gaussian_filter  # scipy loads slowly
 
@@ -275,7 +276,7 @@ def uneven_wall(
     gram = [[(a * b).sum(axis=1) for b in parts] for a in parts]
     right = [(a * left).sum(axis=1) for a in parts]
     prior = np.mean(left**2) / np.array([_TEXTURE, _TILT, _TILT]) ** 2
-    best, plain, shares = np.zeros((len(light), 3)), np.zeros(0), dict[str, Array]()
+    shares, changes = dict[str, Array](), dict[str, tuple[Array, Array]]()
     for width in _TILTED_PX:
 
         def around(values: Array, width: float = width) -> Array:
@@ -290,13 +291,15 @@ def uneven_wall(
         trial = [
             sum(change[:, k, None] * part for k, part in enumerate(basis)) + basis[0] for basis in (own, beyond)
         ]
-        after = _remaining_error(data, other, *trial)
-        if all(after.sum() < squares.sum() for squares in shares.values()):
-            best, alone = change, found[0] / normal[:, 0, 0]
-            plain = _remaining_error(data, other, *(part[0] * (1 + alone[:, None]) for part in both))
-        shares[f"tilt and texture smooth over {width:g} pixels"] = after
-    again = [state.light(one, tilt=best[:, 1:]) * (1 + best[:, :1]) for one in (data, other)]
-    return best, _remaining_error(data, other, *again), plain, shares
+        name = f"tilt and texture smooth over {width:g} pixels"
+        shares[name] = _remaining_error(data, other, *trial)
+        changes[name] = change, found[0] / normal[:, 0, 0]
+    name = min(shares, key=lambda one: shares[one].sum())
+    change, alone = changes[name]
+    again = [state.light(one, tilt=change[:, 1:]) * (1 + change[:, :1]) for one in (data, other)]
+    plain = [seen * (1 + alone[:, None]) for seen in (light, away)]
+    after, textured = (_remaining_error(data, other, *one) for one in (again, plain))
+    return shares, name, change, after, textured
 
 
 def correction_of(data: WallData, light: Array, other: WallData, away: Array) -> tuple[Array, Array, Array]:
@@ -367,9 +370,7 @@ def companion_of(
 
     seen = seen_points(state.pose, data.shape, data.columns, data.rows, tilt=tilt)
     here = target_cells(state.pose, plane)
-    matrix = np.empty(
-        (len(data.columns), len(places), plane.height * plane.width)
-    )  # of each cell at each place
+    matrix = np.empty((len(data.columns), len(places), plane.height * plane.width))
     for k, (x, y) in enumerate(places):
         part = np.empty(matrix[:, k].shape)
         cells = here._replace(points=here.points + np.array([x, y, x * state.pose.travel_slope]))

@@ -446,13 +446,20 @@ def texture(x_m: Array, y_m: Array, seed: int, smooth: float, fine: float, grain
         (12, 0.04, 0.12, smooth, 1.0),
         (48, 0.004, 0.012, fine, grain),
     ):
-        length = np.exp(draw.uniform(np.log(low), np.log(high), waves))
-        turn, phase = draw.uniform(0, 2 * np.pi, waves), draw.uniform(0, 2 * np.pi, waves)
+        length, turn, phase = _random_waves(draw, waves, low, high)
         for n in range(waves if deviation else 0):
             kx = 2 * np.pi / length[n] * np.cos(turn[n]) / stretch
             ky = 2 * np.pi / length[n] * np.sin(turn[n])
             value += deviation * np.sqrt(2 / waves) * np.cos(kx * x_m + ky * y_m + phase[n])
     return np.maximum(value, 0.05)
+
+
+def _random_waves(
+    draw: np.random.Generator, count: int, low_m: float, high_m: float
+) -> tuple[Array, Array, Array]:
+    """Return lengths between two, metres, directions and phases of waves, [count] each."""
+    length = np.exp(draw.uniform(np.log(low_m), np.log(high_m), count))
+    return length, *draw.uniform(0, 2 * np.pi, (2, count))
 
 
 def waves(x_m: Array, y_m: Array, seed: int, deviation: float) -> Array:
@@ -465,8 +472,7 @@ def waves(x_m: Array, y_m: Array, seed: int, deviation: float) -> Array:
         deviation: Standard deviation of either slope (waves of 8 to 60 mm).
     """
     draw, count = np.random.default_rng([seed, 1]), 24
-    length = np.exp(draw.uniform(np.log(0.008), np.log(0.06), count))
-    turn, phase = draw.uniform(0, 2 * np.pi, (2, count))
+    length, turn, phase = _random_waves(draw, count, 0.008, 0.06)
     slopes = np.zeros((*np.shape(x_m), 2))
     for n in range(count):
         way = np.array([np.cos(turn[n]), np.sin(turn[n])])

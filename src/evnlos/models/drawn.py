@@ -357,9 +357,8 @@ class DrawnEvents:
         inner = self._grid.target_of(planes, size_m, prior.target_plane.height)
         z = torch.from_numpy(prior.coefficients(inner.double().numpy()))
         like = self._like(inner, generator)
-        score = torch.einsum("bkl,bl->bk", self._roots[like], z) + self._errors.draw(
-            len(z), generator
-        )  # R^-1 b
+        errors = self._errors.draw(len(z), generator)
+        score = torch.einsum("bkl,bl->bk", self._roots[like], z) + errors  # R^-1 b
         found = torch.einsum("bnkl,bl->bnk", self._back[like], score)
         images = torch.from_numpy(prior.image(found.numpy())).clamp(0, 1)
         seen = self._grid.of_target(images.float(), size_m)

@@ -364,8 +364,9 @@ def estimate_target(
                 "continuous, v2e, brownian or circuit, or --from frames"
             )
         record = record_of(capture.events, law, span, _GAP_S)
-        kept = own[record.pixel]
-        record = replace(record.of_pixels(kept), pixel=(np.cumsum(own) - 1)[record.pixel[kept]])
+        if colour is not None:
+            kept = own[record.pixel]
+            record = replace(record.of_pixels(kept), pixel=(np.cumsum(own) - 1)[record.pixel[kept]])
     more = None if colour is None else LikelihoodSettings(iterations=_FEW_PIXELS)
     found = estimate_sequence(light, basis, law, record, frames, more)
     image, deviation, error, drawn = found.image, found.deviation, found.expected_error, None

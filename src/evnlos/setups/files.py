@@ -308,7 +308,7 @@ def write_fitted(path: str | Path, wall: FittedWall) -> str:
     Raises:
         ConfigError: The name does not end in .safetensors.
     """
-    arrays = {name: torch.tensor(getattr(wall, name)) for name in (*_ARRAYS, "tilt")}
+    arrays = {name: torch.tensor(getattr(wall, name)) for name in (*WALL.names, *WALL.later)}
     return WALL.write(path, arrays, wall.about)
 
 
