@@ -5,6 +5,7 @@
     python benchmarks/tracking.py retreat    # from 28 cm to 32 cm, frames alone: error of the distance, mm rms
     python benchmarks/tracking.py coverage   # 40 random paths; also: coverage turn, coverage depth turn
     python benchmarks/tracking.py coverage camera  # the same with the frame camera's noise in uneven light
+    python benchmarks/tracking.py coverage events  # the same by events alone; also: events depth turn 20
     python benchmarks/tracking.py captures SETUP CAPTURE...  # of captures whose motion is stated
     python benchmarks/tracking.py images 12  # so many sequences; motion known, found, ignored; also: 12 depth
     python benchmarks/tracking.py several 8  # so many pairs of crossing letters, each together and alone
@@ -47,6 +48,7 @@ from evnlos.tracking import (
     static_light,
     temporal_noise,
     track_capture,
+    track_events,
     track_frames,
     track_several,
 )
@@ -122,8 +124,6 @@ def drawn_sequence(seed: int, words: list[str]) -> tuple[RadiometricSetup, Scene
     setup, glyphs, draw = setup.resized((24, 36)), HandwritingGlyphs(), np.random.default_rng(seed)
     times, knots = np.linspace(0.2, 7.8, FRAMES), tuple(np.linspace(0, SECONDS, 5).tolist())
     target = glyphs.target(f"writer{seed % 8:02d}_{'ABDEFHJLNPRSTUVXYZ'[seed % 18]}")
-    at = ((np.arange(len(target.mask)) + 0.5) / len(target.mask) - 0.5) * target.size_m
-    mx, my = np.array([target.mask.sum(0) @ at, target.mask.sum(1) @ at]) / target.mask.sum()
     points = tuple((x + 0.008 * draw.normal(), 0.01 * draw.normal()) for x in np.linspace(-0.06, 0.06, 5))
     away = np.exp(draw.uniform(-0.12, 0.12, 5) if "depth" in words else np.zeros(5))
     away *= setup.distance_m / np.exp(np.log(PathMotion(knots, points, tuple(away)).pose(times).z_m).mean())
@@ -134,10 +134,16 @@ def drawn_sequence(seed: int, words: list[str]) -> tuple[RadiometricSetup, Scene
         frames = CAMERA.capture(wall, times, seed=seed) / np.float32(255)
     else:
         frames = wall.irradiance(times).numpy() + 4e-3 * draw.standard_normal((FRAMES, 24, 36))
-    pose = scene.pose(times)
+    return setup, scene, times, frames, light_of(scene, times)
+
+
+def light_of(scene: Scene, times: NDArray) -> NDArray:
+    """Return the true middles of the light, [N, 2], metres."""
+    mask, pose = scene.target.mask, scene.pose(times)
+    at = ((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * scene.target.size_m
+    mx, my = np.array([mask.sum(0) @ at, mask.sum(1) @ at]) / mask.sum()
     cos, sin = np.cos(pose.rotation_rad), np.sin(pose.rotation_rad)
-    where = np.stack([pose.x_m + cos * mx - sin * my, pose.y_m + sin * mx + cos * my], axis=1)
-    return setup, scene, times, frames, where
+    return np.stack([pose.x_m + cos * mx - sin * my, pose.y_m + sin * mx + cos * my], axis=1)
 
 
 def images(sequences: int, depth: bool) -> None:
@@ -225,15 +231,25 @@ def coverage(words: list[str], sequences: int = 40) -> None:
 
     Each sequence has another letter, path and noise (0.4 % of white); 36 x 24 pixels, 21 frames in 8 s, no
     events. The mean distance is the setup's, as no recording tells it. "camera": noise and fixed pattern of the
-    frame camera, another one each time, and ambient light that falls off by a tenth.
+    frame camera, another one each time, and ambient light that falls off by a tenth. "events": events alone, of
+    72 x 48 pixels with the thresholds, their mismatch and the noise events of `PIXEL`.
     """
     within, most = [], []
     for seed in range(sequences):
         setup, scene, times, frames, where = drawn_sequence(seed, words)
         pose, target = scene.pose(times), scene.target
         settings = Tracking(depth="depth" in words, turning="turn" in words)
-        track = track_frames(frames, times, None, setup, settings)
-        off, stated = [1e3 * (track.position - where)], [1e3 * track.position_sigma]
+        if "events" in words:
+            seen = replace(setup.resized((48, 72)), pixel=PIXEL)
+            events = EventCamera(PIXEL).record(seen.observe(scene), 0.0, SECONDS, seed=seed)
+            span = float(times[0]), float(times[-1])
+            track = track_events(events, span, seen, replace(settings, target_size_m=0.1))
+            where, times = light_of(scene, track.frame_time_s), track.frame_time_s
+            at = np.searchsorted(track.time_s, times)
+            pose = scene.pose(times)
+        else:
+            track, at = track_frames(frames, times, None, setup, settings), np.arange(FRAMES)
+        off, stated = [1e3 * (track.position[at] - where)], [1e3 * track.position_sigma[at]]
         if track.distance is not None:
             off.append(100 * (track.distance.distance_m / pose.z_m - 1)[:, None])
             stated.append(100 * (track.distance.distance_sigma / track.distance.distance_m)[:, None])
@@ -370,7 +386,8 @@ def main() -> None:
         on_captures(sys.argv[2], sys.argv[3:])
         return
     if sys.argv[1:2] == ["coverage"]:
-        coverage(sys.argv[2:])
+        words = sys.argv[2:]
+        coverage(words, int(next((one for one in words if one.isdigit()), "40")))
         return
     rows = [(name, "roughness 0.05", SETUP, CAMERA, PIXEL) for name in PATHS]
     rows += [("curve", f"roughness {r}", replace(SETUP, roughness=r), CAMERA, PIXEL) for r in (0.02, 0.1)]

@@ -38,8 +38,19 @@ from evnlos.app.controls import (
 )
 from evnlos.app.page import Wanted, build_page, simulated
 from evnlos.app.serve import Server, middleware, running
-from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_sequence, own_networks
-from evnlos.app.views import event_views, found_views, limits_of, message_box, seen_views, verdict_box
+from evnlos.app.views import (
+    Networks,
+    event_views,
+    found_views,
+    from_each_frame,
+    from_weights,
+    from_whole_sequence,
+    limits_of,
+    message_box,
+    own_networks,
+    seen_views,
+    verdict_box,
+)
 from evnlos.cli import main
 from evnlos.data import Sampling
 from evnlos.errors import ConfigError, DataError, MissingDependencyError

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from evnlos.app.page import uploaded
-from evnlos.app.solving import Networks
 from evnlos.app.upload import MOST_FILES, read_upload, read_upload_apart, unpack_zip
+from evnlos.app.views import Networks
 from evnlos.errors import DataError
 from evnlos.events import write_events
 from evnlos.models import load_weights

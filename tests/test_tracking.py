@@ -1053,8 +1053,9 @@ def test_what_several_objects_need_is_named() -> None:
 
 def test_lengths_from_a_metre_on_are_told_in_metres() -> None:
     found = {
-        "capture": "far", "unit": "m", "frames": 2, "event_windows": 0, "travel": 1.59795, "direction_deg": 0.0,
-        "mean_speed": 0.2, "position_sigma": 0.004, "speed_sigma": 0.01, "size_change": 1.0, "picture": None,
+        "capture": "far", "unit": "m", "frames": 2, "event_windows": 0, "events": 0, "travel": 1.59795,
+        "direction_deg": 0.0, "mean_speed": 0.2, "position_sigma": 0.004, "speed_sigma": 0.01,
+        "size_change": 1.0, "picture": None,
     }  # fmt: skip
     told = to_text(found)
     assert "1.598 m, direction" in told and "200.000 mm/s" in told and "4.000 mm standard" in told

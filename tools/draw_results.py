@@ -50,7 +50,7 @@ def draw_film() -> None:
     from PIL import Image
 
     from evnlos.app.controls import Controls, picked, simulate_sequence
-    from evnlos.app.solving import from_each_frame, from_weights, own_networks
+    from evnlos.app.views import from_each_frame, from_weights, own_networks
     from evnlos.data import Sampling
     from evnlos.report.pictures import grey
 

@@ -29,6 +29,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, counted, note, silent
 from evnlos.metrics import psnr
 from evnlos.models import ConfidenceReport, Reconstructor, Weights, load_weights, published_setup
+from evnlos.scene import Motion, PathMotion
 from evnlos.setups import Setup, load_setup
 
 _SAME_LIGHT = (0.75, 1.33)
@@ -162,25 +163,20 @@ class Model:
         if not isinstance(recording, Capture):
             recording = read_capture(recording, needs_frames=False, needs_events=False)
         capture = recording
-        capture.info.check_cameras(capture.name, frames=track or eyes.needs_frames, events=eyes.needs_events)
+        capture.info.check_cameras(capture.name, frames=eyes.needs_frames, events=eyes.needs_events)
         weights = self.weights
         if so_far:
             shown = weights.network.seeing(replace(weights.sampling, surface="so-far"))
             weights = replace(weights, network=_causal(shown, "leave --so-far away, or take other weights"))
-        samples = capture_samples(capture, weights.sampling, pattern)
-        stated, warnings = capture.info.motion, list[str]()
+        path, odd = (None, list[str]()) if tracked is None else _path_of(capture, tracked, pattern)
+        samples = capture_samples(replace(capture, path=path), weights.sampling, pattern)
+        stated, warnings = capture.info.motion, odd
         if stated is not None and (stated.retreat_m_s or stated.spin_deg_s):
             warnings.append(
                 f"capture.yaml states a retreat of {stated.retreat_m_s:g} m/s and a spin of "
                 f"{stated.spin_deg_s:g} deg/s; networks know upright targets at one distance, and take x "
                 "and y of the motion alone"
             )
-        if tracked is not None:
-            from evnlos.tracking import track_capture, track_warnings
-
-            path = track_capture(capture, tracked, pattern=pattern)
-            warnings += track_warnings(capture, tracked, path)
-            samples = replace(samples, position_m=path.at(samples.time_s))
         note("network")
         images = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
         unjudged = why_no_confidence(weights, samples)
@@ -228,6 +224,15 @@ def load_model(weights: str | Path) -> Model:
         'frame'
     """
     return Model(load_weights(weights), published_setup(weights))
+
+
+def _path_of(capture: Capture, setup: Setup, pattern: FixedPattern | None) -> tuple[Motion, list[str]]:
+    """Return the motion that a capture shows, and why it may be wrong."""
+    from evnlos.tracking import track_capture, track_warnings
+
+    track = track_capture(capture, setup, pattern=pattern)
+    points = tuple((x, y) for x, y in track.position.tolist())
+    return PathMotion(tuple(track.time_s.tolist()), points), track_warnings(capture, setup, track)
 
 
 def setup_for_track(setup: Setup | None) -> Setup:

@@ -26,12 +26,16 @@ from evnlos.app.controls import (
     settings_of,
     simulate_sequence,
 )
-from evnlos.app.solving import Networks, Reconstruction, from_each_frame, from_weights, from_whole_sequence
 from evnlos.app.upload import read_upload_apart
 from evnlos.app.views import (
+    Networks,
+    Reconstruction,
     View,
     event_views,
     found_views,
+    from_each_frame,
+    from_weights,
+    from_whole_sequence,
     limits_of,
     message_box,
     seen_views,

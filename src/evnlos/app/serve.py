@@ -324,7 +324,7 @@ def running(server: Server, weights: tuple[Path, ...] = (), progress: Progress =
         raise MissingDependencyError("the page needs Gradio: pip install 'evnlos[app]'") from None
     from evnlos.app.controls import Controls, link_of, picked
     from evnlos.app.page import build_page, simulated, theme
-    from evnlos.app.solving import own_networks
+    from evnlos.app.views import own_networks
 
     progress(Step(_OPENING, 1, 3, "stages", within="the first images"))
     networks = own_networks(weights)

@@ -163,7 +163,7 @@ class TrackCommand:
             refuse_existing(self.force, *(self.out.with_stem(f"{self.out.stem}_{k}") for k in ends))
         with ProgressBars() as progress:
             with progress.stage("track", "read the capture", 0, 3):
-                capture = read_capture(self.capture, needs_events=False)
+                capture = read_capture(self.capture, needs_frames=False, needs_events=False)
             with progress.stage("track", "render the light of the setup", 1, 3):
                 setup = None if self.setup is None else linear_setup(self.setup)
                 pattern = pattern_of(self.setup, self.pattern)
@@ -197,7 +197,8 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
     found: dict[str, Any] = {
         "capture": capture.name,
         "unit": track.unit,
-        "frames": len(track.frame_time_s),
+        "frames": 0 if track.events else len(track.frame_time_s),
+        "events": track.events,
         "event_windows": track.event_windows,
         "travel": float(np.hypot(*step)),
         "direction_deg": float(np.degrees(np.arctan2(step[1], step[0]))),
@@ -223,11 +224,10 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
     if truth is not None:
         error = track.position - truth
         speed = np.linalg.norm(np.gradient(truth, track.time_s, axis=0), axis=1)
+        slow = np.sqrt(np.mean(np.square(track.speed - speed)) / np.mean(np.square(speed)))
         found["position_offset"] = error.mean(axis=0).tolist()
         found["position_error"] = float(np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean()))
-        found["speed_error_percent"] = float(
-            100 * np.sqrt(np.mean(np.square(track.speed - speed))) / np.sqrt(np.mean(np.square(speed)))
-        )
+        found["speed_error_percent"] = float(100 * slow)
     return found
 
 
@@ -238,19 +238,19 @@ def to_text(found: dict[str, Any]) -> str:
     def length(name: str, digits: int = 2, of: float | None = None) -> str:
         return length_text(found[name] if of is None else of, unit, digits)
 
+    of = "{events:,} events alone" if found["events"] else "{frames} frames, {event_windows} windows of events"
     lines = [
-        f"{found['capture']}: {found['frames']} frames, {found['event_windows']} windows of events",
+        f"{found['capture']}: {of.format(**found)}",
         f"travel      {length('travel'):>11}, direction {found['direction_deg']:.1f} deg"
         + ("" if unit == "m" else "; image pixels: give --setup for metres"),
         f"mean speed  {length('mean_speed', 3):>11}/s, +- {length('speed_sigma', 3)}/s at an instant",
         f"position    {length('position_sigma', 3):>11} standard deviation"
         + (" by the noise; the setup's own errors come on top" if unit == "m" else ""),
-        f"size        {found['size_change']:8.3f} at the end over the start",
     ]
+    if "size_change" in found:
+        lines.append(f"size        {found['size_change']:8.3f} at the end over the start")
     if "misfit" in found:
-        lines.append(
-            f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by target and setup"
-        )
+        lines.append(f"misfit      {found['misfit']:8.2f} times the noise is left by target and setup")
     if "distance" in found:
         first, last = (length("distance", of=v) for v in found["distance"])
         lines.append(

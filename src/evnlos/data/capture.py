@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -34,7 +34,7 @@ from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, UnknownNameError, printable
 from evnlos.events import CelexOptions, FrameStack, keep_known_polarity, read_events, read_triggers
 from evnlos.machine import Progress, Step, silent
-from evnlos.scene import LineMotion, Scene, SeveralTargets, Target
+from evnlos.scene import LineMotion, Motion, Scene, SeveralTargets, Target
 from evnlos.types import Colour, Events, matching_paths
 from evnlos.untrusted import no_file
 
@@ -56,6 +56,7 @@ class Capture:
         target: The hidden target, or None where it is unknown.
         notes: What reading did to the recordings, a line each.
         others: Other targets that were there too, with their motions, where they are known.
+        path: A motion that was found, for samples to take for the stated one; their truth stays.
     """
 
     name: str
@@ -64,8 +65,9 @@ class Capture:
     frames: NDArray[np.uint8] | NDArray[np.uint16]
     frame_times_us: NDArray[np.int64]
     target: Target | None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     others: tuple[Scene, ...] = ()
+    path: Motion | None = None
 
     @property
     def has_frames(self) -> bool:
@@ -225,9 +227,8 @@ def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
     if filters != FilterInfo():
         from evnlos.events import CleanOptions, clean_events
 
-        events, found = clean_events(
-            events, CleanOptions(filters.hot_pixel_factor, filters.flicker_hz, filters.background_us)
-        )
+        how = CleanOptions(filters.hot_pixel_factor, filters.flicker_hz, filters.background_us)
+        events, found = clean_events(events, how)
         notes.append(f"left out: {found}")
     if not len(events):
         raise DataError(f"{path}: no event is left; check the filters in capture.yaml")
@@ -253,7 +254,7 @@ def _place_in_time(
         return chosen + int(alignment.offset_us), [f"frame times from trigger channel {channel}"]
     if alignment.offset_us != "auto":
         offset = int(alignment.offset_us)
-        if abs(int(times_us[0]) + offset) > _MOST_US or abs(int(times_us[-1]) + offset) > _MOST_US:
+        if max(abs(int(one) + offset) for one in times_us[[0, -1]]) > _MOST_US:
             raise DataError(f"{folder}: frames shifted by {offset} us leave +-{_MOST_US} us; check offset_us")
         return times_us + offset, [f"frames' clock shifted by {offset} us"] if offset else []
     try:
@@ -292,7 +293,8 @@ def _samples_of(capture: Capture, sampling: Sampling, pattern: FixedPattern | No
         frames, peak = mapped(frames, partial(pattern.correct, peak=peak)), 1.0
     if not capture.has_events:  # nothing is in its maps, of whatever kind they are
         sampling = replace(sampling, surface="sae")
-    known: Any = {n: getattr(capture, n) for n in ("motion", "target", "several")} | {"capture": capture.name}
+    known: Any = {n: getattr(capture, n) for n in ("motion", "target", "several", "path")}
+    known["capture"] = capture.name
     yield from iter_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
 
 
@@ -378,11 +380,8 @@ def _write(
     if look is not None:
         look(capture)
     samples = _samples_of(capture, dataset.sampling, pattern)
-    attributes = {
-        "object": capture.name,
-        "config_hash": dataset.config_hash,
-        "camera": capture.info.camera.name,
-    }
+    attributes = {"object": capture.name, "config_hash": dataset.config_hash}
+    attributes["camera"] = capture.info.camera.name
     write_shard(dataset.shard(capture.name), samples, attributes, count=len(capture.frames) - 1)
     return capture.name
 

@@ -209,22 +209,23 @@ def iter_samples(
     target: Target | None = None,
     several: SeveralTargets | None = None,
     capture: str | None = None,
+    path: Motion | None = None,
 ) -> Iterator[Samples]:
     """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
 
     Of traces and what is solved for the target all are held at once. `capture` is the name of a recording,
-    which `corrected` takes, see `event_images`.
+    which `corrected` takes, see `event_images`; `path` is a motion that was found, the truth is at `motion`.
     """
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
-    shape = (sampling.height, sampling.width)
+    shape, seen = (sampling.height, sampling.width), path or motion
     steps = max(1, _BLOCK_BYTES // (4 * (2 * events.width * events.height + math.prod(frames.shape[1:]))))
     tau_us, mode = sampling.tau_s * 1e6, cast(Any, sampling.surface)
     if sampling.is_solved:
         from evnlos.inverse.event_images import event_images  # which compiles
 
         corrects = capture if mode == "corrected" else None
-        those = events, edges_us, motion, sampling.setup, sampling.canvas, corrects
+        those = events, edges_us, seen, sampling.setup, sampling.canvas, corrects
         images = event_images(*those, so_far=mode == "so-far")
         surfaces = frame_blocks(images, steps)
     elif mode in _TRACES:
@@ -236,8 +237,7 @@ def iter_samples(
     for k, (block, surface) in enumerate(zip(blocks, surfaces, strict=True)):
         part = slice(k * steps, k * steps + len(block))
         time_s = np.asarray(edges_us[1:][part], dtype=np.float64) * 1e-6
-        position = None if motion is None else motion.position_m(time_s)
-        truth = None
+        position, truth = None if seen is None else seen.position_m(time_s), None
         if target is not None and motion is not None:
             truth = (several or Scene(target, motion)).truth(sampling.canvas, time_s)
         light = reduce_by_area(block / np.float32(peak), shape)

@@ -217,7 +217,7 @@ def sequence_light(
     matrix = resized.operator(strip, coarse).dense()
     left, right = (factor.numpy() for factor in main_factors(matrix, _RANK))
     if coarse != shape:
-        down, across = (_spline_matrix(*sizes) for sizes in zip(coarse, shape, strict=True))
+        down, across = (spline_matrix(*sizes) for sizes in zip(coarse, shape, strict=True))
         images = np.einsum("yi,xj,ijr->yxr", down, across, left.reshape(*coarse, -1), optimize=True)
         left = images.reshape(-1, left.shape[1])
     targets = np.concatenate([prior.mean[:, None], prior.patterns], axis=1).T.reshape(
@@ -236,7 +236,7 @@ def sequence_light(
     return SequenceLight(left, responses, still, times, shape)
 
 
-def _spline_matrix(coarse: int, fine: int) -> Array:
+def spline_matrix(coarse: int, fine: int) -> Array:
     """Return the cubic spline from pixels [n] to pixels [m] of another size over the same way, [m, n]."""
     from scipy.interpolate import CubicSpline  # scipy loads slowly
 

@@ -222,7 +222,8 @@ def draw_track(
     figure = new_figure((16.5 if len(curves) > 1 else 11.0, 6.4))
     plane, along, speed, *rest = figure.subplots(2, 2 + len(curves) // 2).flat
     figure.suptitle(title)
-    plane.plot(*(scale * track.frame_position.T), ".", color="0.6", label="frames")
+    by = "events" if track.events else "frames"
+    plane.plot(*(scale * track.frame_position.T), ".", color="0.6", label=by)
     plane.plot(*(scale * track.position.T), color="C0", label="track")
     if truth is not None:
         plane.plot(*(scale * truth.T), "--", color="k", linewidth=1, label="truth")
@@ -307,9 +308,6 @@ def draw_confidence(found: Mapping[str, Sequence[ConfidenceCheck]], path: str | 
     return save_figure(figure, path, dpi=100)
 
 
-_FLOOR = 1e-7
-
-
 def draw_identification(found: Identification, path: str | Path) -> Path:
     """Draw singular values, the Picard plot of a typical target, the first modes, truth and linear image.
 
@@ -371,9 +369,9 @@ def _singular_values(axes: Any, found: Sequence[Identification]) -> None:
         values = one.singular.numpy()
         wall, _, place = one.name.partition("-")
         style = {"color": f"C{walls.index(wall)}", "linestyle": "--" if place == "far" else "-", "lw": 1.2}
-        axes.semilogy(np.arange(1, len(values) + 1), _above(values, _FLOOR), label=one.name, **style)
+        axes.semilogy(np.arange(1, len(values) + 1), _above(values, 1e-7), label=one.name, **style)
     axes.axhline(1e-2, color="k", lw=0.7, ls=":")
-    axes.set(xlabel="mode", ylabel="singular value / largest", ylim=(_FLOOR, 1.5), xscale="log")
+    axes.set(xlabel="mode", ylabel="singular value / largest", ylim=(1e-7, 1.5), xscale="log")
     axes.legend(frameon=False, fontsize=8, ncols=2 if len(found) > 6 else 1)
 
 

@@ -1,10 +1,14 @@
-"""From a recording to a track: frames give places, events velocities, a smoother joins them; of several too."""
+"""From a recording to a track.
+
+- Frames give places, events velocities, a smoother joins them; of several targets too.
+- Events alone: their likelihood is asked for the target and its path at once.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,16 +17,24 @@ from numpy.typing import NDArray
 from evnlos.data.capture import Capture
 from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import BackgroundModel, SequenceOperator, SequenceProblem, SeveralSequences
+from evnlos.inverse import SequenceOperator, SequenceProblem, SeveralSequences
 from evnlos.inverse.sequence_problem import matrix_of, strip_of
 from evnlos.setups import Setup
-from evnlos.tracking.motion_fit import MOST_TARGETS, count_targets, first_paths, fit_motion, smooth_together
+from evnlos.tracking.event_motion import EventVelocity, event_velocity, fit_motion_to_events
+from evnlos.tracking.motion_fit import (
+    MOST_TARGETS,
+    MotionFit,
+    count_targets,
+    first_paths,
+    fit_motion,
+    smooth_together,
+)
 from evnlos.tracking.registration import (
-    EventVelocity,
     Registration,
-    event_velocity,
+    plane_map,
     reduced,
     register,
+    static_light,
     temporal_noise,
 )
 from evnlos.tracking.track import (
@@ -32,60 +44,14 @@ from evnlos.tracking.track import (
     Tracks,
     Turn,
     most_likely_acceleration,
-    plane_map,
     smooth,
 )
 from evnlos.types import Events, Plane
 
-_ROUNDS = 20
-_ABOVE = 2.5  # standard deviations over the background from which a pixel shows the object
-_LEAST_SHARE, _ROOM = 0.1, 1.25  # of the target's side: the light's middle need not be the target's
-
-
-def static_light(frames: NDArray, degree: int = 2) -> NDArray[np.float64]:
-    """Return ambient light as a polynomial through the pixels and times that the object's light does not reach.
-
-    A mean over time would take a slow object for background, and so would a minimum where the object never
-    leaves. The object adds light, so samples above the polynomial by more than their noise are dropped, again
-    and again until the fit rests.
-
-    Args:
-        frames: Real [N, H, W].
-        degree: Total degree of the polynomial.
-
-    Returns:
-        float64 [H, W], in the frames' unit.
-
-    Raises:
-        DataError: Fewer than a tenth of the pixels are free of the object.
-    """
-    shape = (int(frames.shape[1]), int(frames.shape[2]))
-    columns = BackgroundModel(degree).polynomials(shape).numpy().reshape(-1, shape[0] * shape[1]).T  # [P, K]
-    middle = np.median(frames, axis=0).ravel().astype(np.float64)
-    swing = frames.max(axis=0).ravel() - middle
-    used = swing <= np.quantile(swing, 0.5)
-    fitted = middle
-    for _ in range(_ROUNDS):
-        if used.mean() < _LEAST_SHARE:
-            raise DataError(
-                f"{100 * used.mean():.0f} % of the wall is free of the object's light, "
-                f"{100 * _LEAST_SHARE:.0f} % is the least; show more of the wall"
-            )
-        known = np.linalg.lstsq(columns[used], middle[used], rcond=None)[0]
-        fitted = (columns @ known).astype(np.float64)
-        rest = middle - fitted
-        # Half of the noise lies below the polynomial, where no object adds light.
-        sigma = np.sqrt(np.mean(np.minimum(rest[used], 0.0) ** 2) * 2)
-        before, used = used, rest <= _ABOVE * sigma
-        if (before == used).all():
-            break
-    return fitted.reshape(shape)
-
-
+_ROOM = 1.25  # of the target's side: the light's middle need not be the target's
+_FINER = 8  # instants of a track by events, for each that the path was found at
 _IMAGE_CELLS = 32  # a side of an image of one of several objects
 _PRIOR, _STATIC = 4.0, 1.0  # weight of its prior, as `evnlos invert` takes it; a pixel's offset over its noise
-_SAME_DISTANCE = 0.03  # share by which a capture's stated distance may differ from its setup's
-_MOST_MISFIT = 1.2  # times the noise: calibrated setups leave 0.95 to 1.05 of captures of their own
 
 
 @dataclass(frozen=True)
@@ -99,6 +65,10 @@ class Tracking:
     """Length of a window of events that gives one velocity, seconds."""
     events: bool = True
     """Use the events; without them only the frames speak."""
+    frames: bool = True
+    """Use the frames; without them, as where the capture has none, the events speak alone, through a setup."""
+    step_s: float = 0.5
+    """Events alone: distance of the instants between which the path is a cubic spline, seconds."""
     target_size_m: float | None = None
     """With a setup: side of a square that holds the object, metres; none = 1.25 of capture.yaml's target."""
     cells: int = 20
@@ -116,9 +86,17 @@ class Tracking:
     def __post_init__(self) -> None:
         if self.columns is not None and self.columns < 16:
             raise ConfigError(f"Tracking.columns is {self.columns}; give 16 pixels or more")
+        if not (self.events or self.frames):
+            raise ConfigError("Tracking.events and Tracking.frames are both off; leave one of them on")
         if self.targets != "auto" and not 1 <= self.targets <= MOST_TARGETS:
             raise ConfigError(f"Tracking.targets is {self.targets}; give 1 to {MOST_TARGETS}, or auto")
-        for name, least in (("cells", 2), ("degree", 0), ("window_s", 1e-6), ("target_size_m", 1e-6)):
+        for name, least in (
+            ("cells", 2),
+            ("degree", 0),
+            ("window_s", 1e-6),
+            ("step_s", 1e-6),
+            ("target_size_m", 1e-6),
+        ):
             if not ((value := getattr(self, name)) is None or value >= least):
                 raise ConfigError(f"Tracking.{name} is {value}; give {least} or more")
 
@@ -223,10 +201,15 @@ def track_capture(
     Raises:
         DataError: Too few frames, or the object does not stand out.
     """
-    frames, times_s = _levels(capture, pattern), capture.frame_times_us.astype(np.float64) * 1e-6
-    events = capture.events if capture.has_events else None
+    times_s = capture.frame_times_us.astype(np.float64) * 1e-6
     settings = replace(settings or Tracking(), target_size_m=(settings or Tracking()).of(capture))
-    return track_frames(frames, times_s, events, setup, settings)
+    if not (capture.has_frames and settings.frames):
+        capture.info.check_cameras(capture.name, frames=False, events=True)
+        if setup is None:
+            raise ConfigError(f"{capture.name}: events alone need a setup to be followed; give one (--setup)")
+        return track_events(capture.events, (float(times_s[0]), float(times_s[-1])), setup, settings)
+    events = capture.events if capture.has_events else None
+    return track_frames(_levels(capture, pattern), times_s, events, setup, settings)
 
 
 def track_frames(
@@ -265,31 +248,30 @@ def track_frames(
     return _in_metres(found, by_events, times_s, small, setup, noise, settings)
 
 
-def track_warnings(capture: Capture, setup: Setup | None, track: Track) -> list[str]:
-    """Return why a track in metres may be wrong by more than it states, a line each; none where nothing is odd.
+def track_events(
+    events: Events, span_s: tuple[float, float], setup: Setup, settings: Tracking | None = None
+) -> Track:
+    """Return the track of one moving object by its events alone: their likelihood through the setup.
 
     Args:
-        capture: The recording.
-        setup: The setup that it was followed with; None: nothing is known.
-        track: What was found.
+        events: The stream.
+        span_s: First and last instant, seconds.
+        setup: The calibrated setup, with its event pixel.
+        settings: How to follow.
+
+    Raises:
+        ConfigError: The setup's event model states no law of its crossings, or several targets are asked for.
+        DataError: Too few events, or they do not tell where the object was.
     """
-    warnings = []
-    stated, motion = capture.distance_m, capture.motion
-    if stated is not None and motion is not None:  # of the start; the setup's is the mean
-        stated += motion.retreat_m_s * (float(np.mean(capture.frame_times_us)) * 1e-6 - motion.start_s)
-    known_m = None if setup is None else setup.default_distance_m
-    if known_m is not None and stated is not None and abs(stated / known_m - 1) > _SAME_DISTANCE:
-        warnings.append(
-            f"capture.yaml states a distance of {stated:g} m, the setup {known_m:g} m, more than "
-            f"{100 * _SAME_DISTANCE:.0f} % apart: lengths and their deviations are wrong; take the setup of "
-            "that distance"
-        )
-    if track.misfit is not None and track.misfit > _MOST_MISFIT:
-        warnings.append(
-            f"the setup leaves {track.misfit:.2f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
-            "positions are worse than their stated deviations; calibrate this very setup (`evnlos calibrate`)"
-        )
-    return warnings
+    settings = settings or Tracking()
+    if settings.targets != 1:
+        raise ConfigError(f"Tracking.targets is {settings.targets}; several are found by frames alone")
+    ways = {"depth": settings.depth, "turning": settings.turning}
+    how = settings.cells, settings.step_s, settings.most_columns
+    times_s, fitted = fit_motion_to_events(events, span_s, setup, settings.of(None), *how, **ways)
+    finer = np.linspace(*span_s, _FINER * (len(times_s) - 1) + 1)
+    track = _smoothed(fitted, times_s, setup, np.unique(np.concatenate([times_s, finer])), [])
+    return replace(track, events=len(events))
 
 
 def _in_metres(
@@ -310,11 +292,7 @@ def _in_metres(
         light, setup, start_m, noise, size_m, settings.cells,
         depth=settings.depth, turning=settings.turning, degree=settings.degree, image_cells=_IMAGE_CELLS,
     )  # fmt: skip
-    variance = np.einsum("nknk->nk", fitted.covariance)
-    values = np.column_stack(
-        [fitted.position_m, *(one for one in (fitted.log_distance, fitted.rotation_rad) if one is not None)]
-    )
-    rates: list = [None] * values.shape[1]
+    rates: list[Any] = []
     if by_events is not None:
         where = np.stack(
             [np.interp(by_events.time_s, times_s, found.place_px[:, k]) for k in range(2)], axis=-1
@@ -322,11 +300,29 @@ def _in_metres(
         slope = to_plane.slope(where)  # [M, 2, 2]
         velocity = np.einsum("mab,mb->ma", slope, by_events.velocity)
         rough = np.einsum("mab,mb->ma", slope**2, by_events.variance)
-        rates[:2] = [(by_events.time_s, velocity[:, k], rough[:, k]) for k in range(2)]
+        rates = [(by_events.time_s, velocity[:, k], rough[:, k]) for k in range(2)]
+    track = _smoothed(fitted, times_s, setup, _instants(times_s, by_events), rates, found, by_events)
+    return replace(track, misfit=fitted.misfit)
+
+
+def _smoothed(
+    fitted: MotionFit,
+    times_s: NDArray[np.float64],
+    setup: Setup,
+    instants: NDArray[np.float64],
+    rates: list[Any],
+    found: Registration | None = None,
+    by_events: EventVelocity | None = None,
+) -> Track:
+    """Return the track through fitted poses, and, where they are measured, rates (instants, rate, variance)."""
+    variance = np.einsum("nknk->nk", fitted.covariance)
+    values = np.column_stack(
+        [fitted.position_m, *(one for one in (fitted.log_distance, fitted.rotation_rad) if one is not None)]
+    )
     blank = np.full(len(times_s), np.nan)
     axes = [Measurements(times_s, *one, blank, blank) for one in zip(values.T, variance.T, strict=True)]
     speeds = [most_likely_acceleration(axes[:2])] * 2 + [most_likely_acceleration([one]) for one in axes[2:]]
-    instants = _instants(times_s, by_events)
+    rates = rates + [None] * (values.shape[1] - len(rates))
     by_frames = fitted.position_m, np.sqrt(variance[:, :2])
     mean, spread = smooth_together(times_s, values, fitted.covariance, rates, speeds, instants)
     track = _track(instants, mean, spread, "m", times_s, by_frames, found, by_events)
@@ -340,7 +336,7 @@ def _in_metres(
     if fitted.rotation_rad is not None:
         turn = Turn(times_s, *(np.degrees(one) for one in curves[-1]))
     image = {"image": fitted.target.numpy(), "size_m": fitted.size_m}
-    return replace(track, distance=distance, turn=turn, misfit=fitted.misfit, **image)
+    return replace(track, distance=distance, turn=turn, **image)
 
 
 def _instants(times_s: NDArray[np.float64], by_events: EventVelocity | None) -> NDArray[np.float64]:

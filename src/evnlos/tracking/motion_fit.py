@@ -18,7 +18,13 @@ from evnlos.machine import note
 from evnlos.optics import DepthTransport
 from evnlos.optics.interpolation import spline_coefficients, spline_slopes, spline_weights
 from evnlos.setups import Setup
-from evnlos.tracking.track import Measurements, most_likely_acceleration, straightened
+from evnlos.tracking.track import (
+    Measurements,
+    most_likely_acceleration,
+    straightened,
+    strip_corners,
+    walk_covariance,
+)
 from evnlos.types import Plane
 
 Array = NDArray[np.float64]
@@ -31,11 +37,10 @@ MOST_TARGETS = 5
 LEAST_ERROR = 0.01
 """Share of the light that any setup is taken to get wrong; no target is told by less of it."""
 _ROUNDS, _TRIAL_ROUNDS, _STRAIGHT_ROUNDS = 24, 12, 5
-_FIRST_FRAMES = 24  # of which first guesses of paths are made
-_STRIDE = 3  # cells between two of them at most
+_FIRST_FRAMES, _STRIDE = 24, 3  # of which first guesses of paths are made; cells between two of them at most
 _BEND = 0.1  # what a bend of one cell costs, of the brightest score
 _STATIC, _PRIOR = 1.0, 3.0  # a pixel's constant offset over its noise; weight of the target's smoothness
-_MARGIN, _STRIP, _LONGEST = 0.3, 0.4, 0.1  # around places, of the strip, of a round: in sides of a target
+_LONGEST = 0.1  # step of a round, sides of a target
 _ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
 _WORSE = 2.0  # of one recording's share that its setup gets wrong, over that of all captures held out
 _UNTOLD = 1e-7  # share of a direction's information that the target leaves, below which it is not told
@@ -112,12 +117,7 @@ def fit_motion(
     """
     target_plane = Plane(cells, cells, target_size_m / cells)
     places = start_m.reshape(-1, 2)
-    margin_m, strip_m = _MARGIN * target_size_m, _STRIP * target_size_m
-    reach = np.concatenate([places + margin_m, places - margin_m])
-    if turning:  # corners reach further
-        reach = np.concatenate([reach + 0.21 * target_size_m, reach - 0.21 * target_size_m])
-    # Whole steps: recordings alike share their matrices.
-    reach = np.stack([np.floor(reach.min(axis=0) / strip_m), np.ceil(reach.max(axis=0) / strip_m)]) * strip_m
+    reach = strip_corners(places, target_size_m, turning)
     shape = (int(light.shape[1]), int(light.shape[2]))
     lights = Lights(setup, strip_of(reach, target_plane), shape, depth, degree)
     seen = lights.seen(light)
@@ -202,7 +202,7 @@ def log_evidence(fit: MotionFit, times_s: Array, noise: float) -> float:
     blank = np.full(count, np.nan)
     for k in range(0, many, 2):
         axes = [Measurements(times_s, places[:, k + j], variance[:, k + j], blank, blank) for j in range(2)]
-        walk = _walk(times_s - times_s[0], np.zeros(count, bool), most_likely_acceleration(axes))
+        walk = walk_covariance(times_s - times_s[0], np.zeros(count, bool), most_likely_acceleration(axes))
         for j, side_m in enumerate(fit.size_m * np.array(REGION)):
             line = side_m**2 / 12 + np.outer(passed, passed) * (side_m / np.ptp(times_s)) ** 2
             covered[:, k + j, :, k + j] = walk + line
@@ -355,10 +355,17 @@ class Lights:
         shape: Size (H, W) of the images, pixels.
         depth: Whether other distances than the setup's are asked for.
         degree: Total degree of the ambient light; None: there is none.
+        rank: So many main images of all distances are kept; None: all.
     """
 
     def __init__(
-        self, setup: Setup, strip: Plane, shape: tuple[int, int], depth: bool, degree: int | None = None
+        self,
+        setup: Setup,
+        strip: Plane,
+        shape: tuple[int, int],
+        depth: bool,
+        degree: int | None = None,
+        rank: int | None = None,
     ) -> None:
         self.strip, setup = strip, setup.seen_by(shape)
         self._own_m = setup.default_distance_m or 1.0
@@ -370,17 +377,21 @@ class Lights:
             away = DepthTransport(lambda _: own, 0.99 * self._own_m, 1.01 * self._own_m, strip, shape)
         own = away.basis.double()
         smooth = own[:, :0] if degree is None else _ambient(shape, degree)
-        self._basis = torch.linalg.qr(torch.cat([smooth, own], dim=1))[0]
+        self.basis = torch.linalg.qr(torch.cat([smooth, own], dim=1))[0]
         self._away, self.ambient = copy(away), smooth.shape[1]
         self._known: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}
-        turn = self._basis.mT @ own
+        turn = self.basis.mT @ own
         # All at once take gigabytes.
         planes = ((turn @ one.double()).unflatten(-1, strip.shape) for one in away.nodes)
         self._away.nodes = torch.stack([spline_coefficients(one).flatten(-2).float() for one in planes])
+        if rank is not None:
+            parts = self._away.nodes.double().transpose(0, 1).flatten(1)
+            ways = torch.linalg.eigh(parts @ parts.mT)[1][:, -rank:]
+            self.basis, self._away.nodes = self.basis @ ways, ways.mT.float() @ self._away.nodes
 
     def seen(self, light: torch.Tensor) -> torch.Tensor:
         """Return frames [N, H, W] as their parts [N, P], float64."""
-        return light.double().flatten(1) @ self._basis
+        return light.double().flatten(1) @ self.basis
 
     def at(self, log_distance: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return splines over the strip, [P, cells], and their derivative by ln(distance)."""
@@ -559,7 +570,7 @@ def smooth_together(
         t = np.concatenate([times_s, when, at_s, at_s]) - began
         is_rate = np.repeat([False, True, False, True], [count, len(when), len(at_s), len(at_s)])
         seen.append(np.concatenate([values[:, k] - middle[k], told]))
-        spread.append(_walk(t, is_rate, accelerations[k]))
+        spread.append(walk_covariance(t, is_rate, accelerations[k]))
         noise.append(np.concatenate([np.zeros(count), variance]))
         lines.append(np.stack([~is_rate, np.where(is_rate, 1.0, t)], axis=1))  # of the first value and rate
     starts = np.concatenate([[0], np.cumsum([len(one) for one in seen])])
@@ -587,14 +598,3 @@ def smooth_together(
         mean[:, :, k], sigma[:, :, k] = (v.reshape(2, -1).T for v in (found, np.sqrt(np.maximum(left, 0.0))))
         mean[:, 0, k] += middle[k]
     return mean, sigma
-
-
-def _walk(t: Array, is_rate: NDArray[np.bool_], acceleration: float) -> Array:
-    """Return the covariance of values and rates at instants t >= 0, both 0 at 0; the rate walks at random."""
-    s, r = t[:, None], t[None, :]
-    low = np.minimum(s, r)
-    value = low**2 * (np.maximum(s, r) / 2 - low / 6)
-    rate_value = low * r - low**2 / 2  # rate at s, value at r
-    row, column = is_rate[:, None], is_rate[None, :]
-    both = np.where(row, np.where(column, low, rate_value), np.where(column, rate_value.T, value))
-    return acceleration * both

@@ -1,6 +1,6 @@
 """Where the object's image lies in each frame: the likeliest shift against a template made of them all.
 
-- How fast the image of the object slides, from the events between its frames.
+- From the image's motion to the target's: where a camera sees light from a place behind the corner.
 """
 
 from __future__ import annotations
@@ -13,18 +13,24 @@ from numpy.typing import NDArray
 
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
-from evnlos.events import event_histogram
+from evnlos.inverse import BackgroundModel
 from evnlos.machine import note
 from evnlos.optics.interpolation import MARGIN, spline_coefficients
-from evnlos.types import Events
+from evnlos.setups import Setup
+from evnlos.types import Plane
 
 _LEAST_FRAMES = 4
 _EDGE = 0.02  # of the template's peak; weaker light is left to the background
 _LEAST_SIGNAL = 6.0  # standard deviations of the noise that the object's peak must have
 _LEAST_EXPLAINED = 0.5  # share of what changes between the frames that one shifted image must explain
 _STEP = np.array([2.0, 2.0, 0.2, 0.2])  # largest step of (x, y, ln size, ln brightness), pixels and shares
-_FIT_STEPS = 2
-_ROUNDS = 8
+_REACH = (20, 14)  # cells of the target's plane that the map is fitted on, (x, y), five to a target's side
+_SEEN = 0.2  # of the brightest cell's light; darker cells lie partly outside the image
+_FIT_STEPS, _ROUNDS, _STATIC_ROUNDS = 2, 8, 20
+_ABOVE, _LEAST_SHARE = (
+    2.5,
+    0.1,
+)  # deviations from which a pixel shows the object; share of the wall that is free
 
 
 def reduced(frames: NDArray, columns: int) -> NDArray:
@@ -34,6 +40,46 @@ def reduced(frames: NDArray, columns: int) -> NDArray:
     height, width = int(frames.shape[1]), int(frames.shape[2])
     columns = min(columns, width)
     return reduce_by_area(frames, (max(1, round(height * columns / width)), columns))
+
+
+def static_light(frames: NDArray, degree: int = 2) -> NDArray[np.float64]:
+    """Return ambient light as a polynomial through the pixels and times that the object's light does not reach.
+
+    A mean over time would take a slow object for background, and so would a minimum where the object never
+    leaves. The object adds light, so samples above the polynomial by more than their noise are dropped, again
+    and again until the fit rests.
+
+    Args:
+        frames: Real [N, H, W].
+        degree: Total degree of the polynomial.
+
+    Returns:
+        float64 [H, W], in the frames' unit.
+
+    Raises:
+        DataError: Fewer than a tenth of the pixels are free of the object.
+    """
+    shape = (int(frames.shape[1]), int(frames.shape[2]))
+    columns = BackgroundModel(degree).polynomials(shape).numpy().reshape(-1, shape[0] * shape[1]).T  # [P, K]
+    middle = np.median(frames, axis=0).ravel().astype(np.float64)
+    swing = frames.max(axis=0).ravel() - middle
+    used = swing <= np.quantile(swing, 0.5)
+    fitted = middle
+    for _ in range(_STATIC_ROUNDS):
+        if used.mean() < _LEAST_SHARE:
+            raise DataError(
+                f"{100 * used.mean():.0f} % of the wall is free of the object's light, "
+                f"{100 * _LEAST_SHARE:.0f} % is the least; show more of the wall"
+            )
+        known = np.linalg.lstsq(columns[used], middle[used], rcond=None)[0]
+        fitted = (columns @ known).astype(np.float64)
+        rest = middle - fitted
+        # Half of the noise lies below the polynomial, where no object adds light.
+        sigma = np.sqrt(np.mean(np.minimum(rest[used], 0.0) ** 2) * 2)
+        before, used = used, rest <= _ABOVE * sigma
+        if (before == used).all():
+            break
+    return fitted.reshape(shape)
 
 
 def temporal_noise(frames: NDArray) -> float:
@@ -288,111 +334,67 @@ def _newton(
     return torch.linalg.solve(normal, flat @ (light - picture).flatten()).numpy(), normal, picture
 
 
-_FLOOR = 0.02  # of the frames' peak: light below has no logarithm worth a slope
-_LEAST_EVENTS = 200
-_WINDOWS_AT_A_TIME = 64
-
-
 @dataclass(frozen=True, eq=False)
-class EventVelocity:
-    """Velocities of the image.
+class PlaneMap:
+    """A smooth map from the middle of the light on the sensor to a place on the target's plane.
 
     Args:
-        time_s: Middle of each window, [M], seconds.
-        velocity: (x, y), float64 [M, 2], pixels per second, of the reduced frames.
-        variance: Of each component, [M, 2].
+        coefficients: Of 1, u, v, u^2, u v, v^2 for x and y, [6, 2], metres; u, v in half widths.
+        shape: Size (H, W) of the image, pixels.
+        error_m: Root mean square misfit of the map over the region, metres.
     """
 
-    time_s: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+    shape: tuple[int, int]
+    error_m: float
+
+    def __call__(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return places (x, y), metres, [..., 2], of pixels [..., 2]."""
+        return _terms(self._scaled(place_px)) @ self.coefficients
+
+    def slope(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return d(x, y) / d(column, row), metres per pixel, [..., 2, 2]."""
+        half = 0.5
+        steps = half * np.eye(2)
+        return np.stack(
+            [(self(place_px + step) - self(place_px - step)) / (2 * half) for step in steps], axis=-1
+        )
+
+    def _scaled(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        middle = np.array([(self.shape[1] - 1) / 2, (self.shape[0] - 1) / 2])
+        return (place_px - middle) / (self.shape[1] / 2)
 
 
-def event_velocity(
-    events: Events, found: Registration, times_s: NDArray[np.float64], window_s: float
-) -> EventVelocity | None:
-    """Return the velocity in windows between the first and the last frame, None where events say nothing.
-
-    A sliding image changes a pixel's log light L by -grad L . d for a small displacement d, and the pixel
-    sends an ON event for each rise by its threshold, an OFF event for each fall. Thresholds and noise rates are
-    not known: they are found as the two lines (rate of events over expected change) that fit the frames' own
-    displacements. Then ON / a - OFF / b in each window is a linear function of d, solved by least squares with
-    the variance of Poisson counts.
+def plane_map(setup: Setup, shape: tuple[int, int], target_size_m: float = 0.1) -> PlaneMap:
+    """Fit the map to the images of small cells all over the target's plane.
 
     Args:
-        events: The stream.
-        found: Template and places from the frames.
-        times_s: Instants of the frames on the events' clock, [N], seconds.
-        window_s: Length of a window, seconds.
+        setup: The setup.
+        shape: Size (H, W) of the image, pixels.
+        target_size_m: Side of a target plane, metres: the map is fitted on 4 x 2.8 of them.
+
+    Raises:
+        DataError: The middle of the light hardly moves with the cell: a matte wall shows no place that way.
     """
-    count = int(np.floor((times_s[-1] - times_s[0]) / window_s + 1e-9))
-    if count < 1 or len(events) < _LEAST_EVENTS:
-        return None
-    edges = times_s[0] + np.arange(count + 1) * window_s
-    middle = (edges[:-1] + edges[1:]) / 2
-    shape = (found.background.shape[0], found.background.shape[1])
-    counts = _counts(events, edges, shape)  # [M, 2, P], events a reduced pixel
-    place, ends = _between(found.place_px, times_s, middle), _between(found.place_px, times_s, edges)
-    slopes = _log_slopes(found, place, shape)  # [M, 2, P]
-    change = -np.einsum("maP,ma->mP", slopes, np.diff(ends, axis=0))
-    lines = [_line(counts[:, k].ravel(), np.maximum(sign * change, 0).ravel()) for k, sign in ((0, 1), (1, -1))]
-    (dark_on, on), (dark_off, off) = lines
-    if not (on > 0 and off > 0):
-        return None
-    signed = (counts[:, 0] - dark_on) / on - (counts[:, 1] - dark_off) / off
-    rate = (dark_on + on * np.maximum(change, 0)) / on**2 + (dark_off + off * np.maximum(-change, 0)) / off**2
-    # A pixel has no opinion before its light has changed by about a threshold since the recording began.
-    awake = np.cumsum(np.abs(change), axis=0) >= 0.5 * (1 / on + 1 / off)
-    weight = awake / np.maximum(rate, 1e-12)
-    normal = np.einsum("maP,mbP,mP->mab", slopes, slopes, weight)
-    right = -np.einsum("maP,mP,mP->ma", slopes, signed, weight)
-    told = np.linalg.eigvalsh(normal)[:, 0] > 1e-9
-    if not told.any():
-        return None
-    middle, slopes, signed, weight = middle[told], slopes[told], signed[told], weight[told]
-    inverse, right = np.linalg.inv(normal[told]), right[told]
-    moved = np.einsum("mab,mb->ma", inverse, right)
-    left = signed + np.einsum("maP,ma->mP", slopes, moved)
-    spread = float(
-        (np.square(left) * weight).sum() / np.count_nonzero(weight)
-    )  # above 1 where the image is not what was thought
-    variance = np.diagonal(inverse, axis1=1, axis2=2) * max(spread, 1.0) / window_s**2
-    return EventVelocity(middle, moved / window_s, variance)
+    cells = Plane(_REACH[1], _REACH[0], target_size_m / 5)
+    pictures = setup.matrix(shape, cells).mT.reshape(-1, *shape).numpy()
+    light = pictures.sum(axis=(1, 2))
+    border = np.concatenate([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], axis=1)
+    whole = border.max(axis=1) < 0.1 * pictures.max(axis=(1, 2))
+    used = (light > _SEEN * light.max()) & whole
+    if used.sum() < 12:
+        raise DataError(
+            f"{int(used.sum())} of {len(used)} places of the target's plane make a bounded image, 12 are the "
+            "least: this wall does not show where its light comes from; track without the setup"
+        )
+    place = np.stack(np.meshgrid(cells.x_m, cells.y_m), axis=-1).reshape(-1, 2)[used]
+    blank = PlaneMap(np.zeros((6, 2)), shape, 0.0)
+    terms = _terms(blank._scaled(middle_of_light(pictures[used])))
+    coefficients = np.linalg.lstsq(terms, place, rcond=None)[0].astype(np.float64)
+    error = float(np.sqrt(np.mean(np.square(terms @ coefficients - place).sum(axis=1))))
+    return PlaneMap(coefficients, shape, error)
 
 
-def _counts(events: Events, edges_s: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the events of each window, polarity and reduced pixel, [M, 2, P]."""
-    edges = np.round(edges_s * 1e6).astype(np.int64)
-    scale = events.height * events.width / (shape[0] * shape[1])
-    parts = []
-    for start in range(0, len(edges) - 1, _WINDOWS_AT_A_TIME):
-        full = event_histogram(events, edges[start : start + _WINDOWS_AT_A_TIME + 1])
-        parts.append(reduce_by_area(full, shape) * scale)
-    return np.concatenate(parts).reshape(len(edges) - 1, 2, -1).astype(np.float64)
-
-
-def _log_slopes(
-    found: Registration, place_px: NDArray[np.float64], shape: tuple[int, int]
-) -> NDArray[np.float64]:
-    """Return the slopes (x, y) of the log light with the object at each place, [M, 2, P], a pixel."""
-    floor = _FLOOR * float(found.template.max())
-    slopes = np.empty((len(place_px), 2, shape[0] * shape[1]))
-    for k, place in enumerate(place_px):
-        light = found.picture(place, shape).numpy()
-        # What rests has slopes too, but they do not move.
-        down, across = (g / np.maximum(light + found.background, floor) for g in np.gradient(light))
-        slopes[k] = across.ravel(), down.ravel()
-    return slopes
-
-
-def _line(counts: NDArray[np.float64], change: NDArray[np.float64]) -> tuple[float, float]:
-    """Return (events without change, events per unit of change) by least squares."""
-    columns = np.stack([np.ones_like(change), change], axis=1)
-    dark, slope = np.linalg.lstsq(columns, counts, rcond=None)[0].tolist()
-    return max(dark, 1e-6), slope
-
-
-def _between(
-    place: NDArray[np.float64], times_s: NDArray[np.float64], at_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    return np.stack([np.interp(at_s, times_s, place[:, k]) for k in range(2)], axis=-1)
+def _terms(scaled: NDArray[np.float64]) -> NDArray[np.float64]:
+    u, v = scaled[..., 0], scaled[..., 1]
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)

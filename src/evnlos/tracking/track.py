@@ -1,6 +1,5 @@
-"""Tracks: geometry from image to target, a smoother over positions and velocities, and its result.
+"""Tracks: a smoother over positions and velocities, and its result.
 
-- From the image's motion to the target's: where a camera sees light from a place behind the corner.
 - A Kalman smoother that fuses positions and velocities, and finds by itself how much the motion may change.
 - A track: where the hidden object was at any time of a recording, how fast it went, and how sure that is.
 """
@@ -13,80 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evnlos.data.capture import Capture
 from evnlos.errors import DataError
 from evnlos.setups import Setup
-from evnlos.tracking.registration import middle_of_light
-from evnlos.types import Plane
-
-_REACH = (20, 14)  # cells of the target's plane that the map is fitted on, (x, y), five to a target's side
-_SEEN = 0.2  # of the brightest cell's light; darker cells lie partly outside the image
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneMap:
-    """A smooth map from the middle of the light on the sensor to a place on the target's plane.
-
-    Args:
-        coefficients: Of 1, u, v, u^2, u v, v^2 for x and y, [6, 2], metres; u, v in half widths.
-        shape: Size (H, W) of the image, pixels.
-        error_m: Root mean square misfit of the map over the region, metres.
-    """
-
-    coefficients: NDArray[np.float64]
-    shape: tuple[int, int]
-    error_m: float
-
-    def __call__(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return places (x, y), metres, [..., 2], of pixels [..., 2]."""
-        return _terms(self._scaled(place_px)) @ self.coefficients
-
-    def slope(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return d(x, y) / d(column, row), metres per pixel, [..., 2, 2]."""
-        half = 0.5
-        steps = half * np.eye(2)
-        return np.stack(
-            [(self(place_px + step) - self(place_px - step)) / (2 * half) for step in steps], axis=-1
-        )
-
-    def _scaled(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        middle = np.array([(self.shape[1] - 1) / 2, (self.shape[0] - 1) / 2])
-        return (place_px - middle) / (self.shape[1] / 2)
-
-
-def plane_map(setup: Setup, shape: tuple[int, int], target_size_m: float = 0.1) -> PlaneMap:
-    """Fit the map to the images of small cells all over the target's plane.
-
-    Args:
-        setup: The setup.
-        shape: Size (H, W) of the image, pixels.
-        target_size_m: Side of a target plane, metres: the map is fitted on 4 x 2.8 of them.
-
-    Raises:
-        DataError: The middle of the light hardly moves with the cell: a matte wall shows no place that way.
-    """
-    cells = Plane(_REACH[1], _REACH[0], target_size_m / 5)
-    pictures = setup.matrix(shape, cells).mT.reshape(-1, *shape).numpy()
-    light = pictures.sum(axis=(1, 2))
-    border = np.concatenate([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], axis=1)
-    whole = border.max(axis=1) < 0.1 * pictures.max(axis=(1, 2))
-    used = (light > _SEEN * light.max()) & whole
-    if used.sum() < 12:
-        raise DataError(
-            f"{int(used.sum())} of {len(used)} places of the target's plane make a bounded image, 12 are the "
-            "least: this wall does not show where its light comes from; track without the setup"
-        )
-    place = np.stack(np.meshgrid(cells.x_m, cells.y_m), axis=-1).reshape(-1, 2)[used]
-    blank = PlaneMap(np.zeros((6, 2)), shape, 0.0)
-    terms = _terms(blank._scaled(middle_of_light(pictures[used])))
-    coefficients = np.linalg.lstsq(terms, place, rcond=None)[0].astype(np.float64)
-    error = float(np.sqrt(np.mean(np.square(terms @ coefficients - place).sum(axis=1))))
-    return PlaneMap(coefficients, shape, error)
-
-
-def _terms(scaled: NDArray[np.float64]) -> NDArray[np.float64]:
-    u, v = scaled[..., 0], scaled[..., 1]
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-
 
 _LIKELY = np.logspace(-3, 3, 25)  # of (spread of the positions / duration^1.5)^2
 _WIDE = 1e3  # the first guess's standard deviation over the spread of the positions
@@ -198,6 +126,19 @@ def most_likely_acceleration(axes: list[Measurements]) -> float:
     return float(unit * _LIKELY[int(np.argmax(scores))])
 
 
+def walk_covariance(
+    t: NDArray[np.float64], is_rate: NDArray[np.bool_], acceleration: float
+) -> NDArray[np.float64]:
+    """Return the covariance of values and rates at instants t >= 0, both 0 at 0; the rate walks at random."""
+    s, r = t[:, None], t[None, :]
+    low = np.minimum(s, r)
+    value = low**2 * (np.maximum(s, r) / 2 - low / 6)
+    rate_value = low * r - low**2 / 2  # rate at s, value at r
+    row, column = is_rate[:, None], is_rate[None, :]
+    both = np.where(row, np.where(column, low, rate_value), np.where(column, rate_value.T, value))
+    return acceleration * both
+
+
 _KNOWN_DISTANCE, _KNOWN_TURN_DEG = 0.03, 5.0  # standard deviations up to which a pose counts as known
 
 
@@ -279,6 +220,7 @@ class Track:
         misfit: With a setup: what it leaves of the frames' changes over their noise, rms; deviations hold it.
         image: Likewise, one object's brightness at its mean distance and turn, as in `Tracks`, float64 [n, n].
         size_m: Side of the image, metres.
+        events: Number of events where they alone were followed; frame_... are then of the path's knots.
     """
 
     time_s: NDArray[np.float64]
@@ -298,6 +240,7 @@ class Track:
     misfit: float | None = None
     image: NDArray[np.float64] | None = None
     size_m: float = 0.0
+    events: int = 0
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -371,6 +314,16 @@ class Track:
         return found
 
 
+_MARGIN, _STRIP, _CORNERS = 0.3, 0.4, 0.21  # around places, of a step, of a turn's corners: sides of a target
+
+
+def strip_corners(places_m: NDArray[np.float64], size_m: float, turning: bool) -> NDArray[np.float64]:
+    """Return the corners [2, 2] of all that a target of a side near places [N, 2] may cover, metres."""
+    margin, step = (_MARGIN + _CORNERS * turning) * size_m, _STRIP * size_m
+    low, high = places_m.min(axis=0) - margin, places_m.max(axis=0) + margin
+    return np.stack([np.floor(low / step), np.ceil(high / step)]) * step  # recordings alike share matrices
+
+
 def straightened(
     step: NDArray[np.float64], covariance: NDArray[np.float64], pose: NDArray[np.float64], bend: float
 ) -> NDArray[np.float64]:
@@ -398,3 +351,34 @@ class Tracks:
     images: NDArray[np.float64]
     size_m: float
     gains: tuple[float, ...] = ()
+
+
+_SAME_DISTANCE = 0.03  # share by which a capture's stated distance may differ from its setup's
+_MOST_MISFIT = 1.2  # times the noise: calibrated setups leave 0.95 to 1.05 of captures of their own
+
+
+def track_warnings(capture: Capture, setup: Setup | None, track: Track) -> list[str]:
+    """Return why a track in metres may be wrong by more than it states, a line each; none where nothing is odd.
+
+    Args:
+        capture: The recording.
+        setup: The setup that it was followed with; None: nothing is known.
+        track: What was found.
+    """
+    warnings = []
+    stated, motion = capture.distance_m, capture.motion
+    if stated is not None and motion is not None:  # of the start; the setup's is the mean
+        stated += motion.retreat_m_s * (float(np.mean(capture.frame_times_us)) * 1e-6 - motion.start_s)
+    known_m = None if setup is None else setup.default_distance_m
+    if known_m is not None and stated is not None and abs(stated / known_m - 1) > _SAME_DISTANCE:
+        warnings.append(
+            f"capture.yaml states a distance of {stated:g} m, the setup {known_m:g} m, more than "
+            f"{100 * _SAME_DISTANCE:.0f} % apart: lengths and their deviations are wrong; take the setup of "
+            "that distance"
+        )
+    if track.misfit is not None and track.misfit > _MOST_MISFIT:
+        warnings.append(
+            f"the setup leaves {track.misfit:.2f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
+            "positions are worse than their stated deviations; calibrate this very setup (`evnlos calibrate`)"
+        )
+    return warnings
