@@ -134,16 +134,7 @@ def drawn_sequence(seed: int, words: list[str]) -> tuple[RadiometricSetup, Scene
         frames = CAMERA.capture(wall, times, seed=seed) / np.float32(255)
     else:
         frames = wall.irradiance(times).numpy() + 4e-3 * draw.standard_normal((FRAMES, 24, 36))
-    return setup, scene, times, frames, light_of(scene, times)
-
-
-def light_of(scene: Scene, times: NDArray) -> NDArray:
-    """Return the true middles of the light, [N, 2], metres."""
-    mask, pose = scene.target.mask, scene.pose(times)
-    at = ((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * scene.target.size_m
-    mx, my = np.array([mask.sum(0) @ at, mask.sum(1) @ at]) / mask.sum()
-    cos, sin = np.cos(pose.rotation_rad), np.sin(pose.rotation_rad)
-    return np.stack([pose.x_m + cos * mx - sin * my, pose.y_m + sin * mx + cos * my], axis=1)
+    return setup, scene, times, frames, scene.light_m(times)
 
 
 def images(sequences: int, depth: bool) -> None:
@@ -244,7 +235,7 @@ def coverage(words: list[str], sequences: int = 40) -> None:
             events = EventCamera(PIXEL).record(seen.observe(scene), 0.0, SECONDS, seed=seed)
             span = float(times[0]), float(times[-1])
             track = track_events(events, span, seen, replace(settings, target_size_m=0.1))
-            where, times = light_of(scene, track.frame_time_s), track.frame_time_s
+            where, times = scene.light_m(track.frame_time_s), track.frame_time_s
             at = np.searchsorted(track.time_s, times)
             pose = scene.pose(times)
         else:

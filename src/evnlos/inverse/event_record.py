@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -114,6 +114,18 @@ class EventRecord:
         index = np.cumsum(chosen) - 1
         origin = np.where(self.origin >= 0, index[self.origin], -1)[chosen]
         return EventRecord(self.pixel[chosen], self.t_s[chosen], self.sign[chosen], origin)
+
+    def every(self, stride: int, width: int) -> EventRecord:
+        """Return the record of every so many rows and columns, numbered as by `SequenceLight.every`.
+
+        Args:
+            stride: 1 keeps all of them.
+            width: Columns of the sensor.
+        """
+        row, column = np.divmod(self.pixel, width)
+        kept = (row % stride == 0) & (column % stride == 0)
+        number = row[kept] // stride * -(-width // stride) + column[kept] // stride
+        return replace(self.of_pixels(kept), pixel=number)
 
     def change(self, light: SequenceLight, levels: Levels) -> Array:
         """Return by how much the level moved since the origin, the leak's share included, [N]; NaN = none."""

@@ -216,10 +216,6 @@ def sequence_light(
     resized = setup.resized(shape)
     matrix = resized.operator(strip, coarse).dense()
     left, right = (factor.numpy() for factor in main_factors(matrix, _RANK))
-    if coarse != shape:
-        down, across = (spline_matrix(*sizes) for sizes in zip(coarse, shape, strict=True))
-        images = np.einsum("yi,xj,ijr->yxr", down, across, left.reshape(*coarse, -1), optimize=True)
-        left = images.reshape(-1, left.shape[1])
     targets = np.concatenate([prior.mean[:, None], prior.patterns], axis=1).T.reshape(
         -1, *prior.target_plane.shape
     )
@@ -233,10 +229,19 @@ def sequence_light(
     along = resized.companion_light(places)
     if along is not None:
         still = still + along.flatten(1).T.numpy()
-    return SequenceLight(left, responses, still, times, shape)
+    return SequenceLight(on_pixels(left, coarse, shape), responses, still, times, shape)
 
 
-def spline_matrix(coarse: int, fine: int) -> Array:
+def on_pixels(images: Array, coarse: tuple[int, int], shape: tuple[int, int]) -> Array:
+    """Return images [h w, r] of some rows and columns on those of a camera, [H W, r], by cubic splines."""
+    if coarse == shape:
+        return images
+    down, across = (_spline_matrix(*sizes) for sizes in zip(coarse, shape, strict=True))
+    fine = np.einsum("yi,xj,ijr->yxr", down, across, images.reshape(*coarse, -1), optimize=True)
+    return fine.reshape(-1, images.shape[1])
+
+
+def _spline_matrix(coarse: int, fine: int) -> Array:
     """Return the cubic spline from pixels [n] to pixels [m] of another size over the same way, [m, n]."""
     from scipy.interpolate import CubicSpline  # scipy loads slowly
 

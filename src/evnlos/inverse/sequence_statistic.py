@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -195,13 +195,10 @@ class EventSolver:
     def _solved(self, events: Events, until_s: float, unknown: Array) -> EventStatistic:
         span = (float(self.light.times_s[0]), until_s)
         record, last = record_of(events, self.law, span, self.settings.gap_s), self.settings.least_noise
-        row, column = np.divmod(record.pixel, events.width)
         shares = np.minimum(np.arange(_FIRST_STEPS) / _ANNEALED, 1.0)
         noises = self.settings.first_noise ** (1 - shares) * last**shares
         for stride, solver in self._coarse:
-            kept = (row % stride == 0) & (column % stride == 0)
-            number = row[kept] // stride * solver.light.shape[1] + column[kept] // stride
-            solver.improve(replace(record.of_pixels(kept), pixel=number), unknown, noises)
+            solver.improve(record.every(stride, events.width), unknown, noises)
             noises = noises[-1:]
         return self.improve(record, unknown, noises)
 

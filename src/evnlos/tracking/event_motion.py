@@ -16,7 +16,7 @@ those of the target, so the likelihood of the events (`EventSolver`) is asked fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -37,7 +37,7 @@ from evnlos.inverse import (
     handwritten_prior,
     record_of,
 )
-from evnlos.inverse.sequence_light import spline_matrix
+from evnlos.inverse.sequence_light import on_pixels
 from evnlos.inverse.sequence_problem import strip_of
 from evnlos.machine import note
 from evnlos.scene import Ink
@@ -226,7 +226,8 @@ def fit_motion_to_events(
     coarse = (max(1, round(shape[0] * columns / shape[1])), columns)
     ambient = seen.ambient_light(shape)
     law = _law(seen, WHITE_DN * float(ambient.mean()))
-    start_m = _first_path(events, seen, law, times, size_m, coarse)
+    counts = event_counts(events, times, coarse)
+    start_m = _first_path(counts, ambient.numpy(), seen, law, times, size_m, coarse)
     fit = EventFit(
         seen, strip_corners(start_m, size_m, turning), times, shape, coarse, size_m, cells, depth, turning
     )
@@ -234,7 +235,7 @@ def fit_motion_to_events(
     record = record_of(events, law, span_s, fit.settings.gap_s)
     with threadpool_limits(1):  # products are small: a second thread mostly waits
         path, covariance = fit.solved(start, record, law, events.width)
-    share, chance = fit.explained(path, covariance, event_counts(events, times, coarse), law, coarse)
+    share, chance = fit.explained(path, covariance, counts, law, coarse)
     if share < _BEYOND_CHANCE * chance:
         raise DataError(
             f"the path explains {100 * share:.2g} % of what the events say of the light, noise alone lets it "
@@ -253,8 +254,19 @@ def _law(setup: Setup, typical_dn: float) -> CrossingLaw:
     return law
 
 
+def _said(counts: Array, law: CrossingLaw) -> Array:
+    """Return how the log light changes by the thresholds that events [M, 2, P] passed, [M, P]."""
+    return law.threshold_on * counts[:, 0] - law.threshold_off * counts[:, 1]
+
+
 def _first_path(
-    events: Events, setup: Setup, law: CrossingLaw, times_s: Array, size_m: float, shape: tuple[int, int]
+    counts: Array,
+    ambient: NDArray[np.float32],
+    setup: Setup,
+    law: CrossingLaw,
+    times_s: Array,
+    size_m: float,
+    shape: tuple[int, int],
 ) -> Array:
     """Return a first guess of the places at instants, [N, 2], metres: where the light's middle seems to be.
 
@@ -262,12 +274,12 @@ def _first_path(
     """
     from scipy.ndimage import gaussian_filter  # scipy loads slowly
 
-    counts = event_counts(events, times_s, shape)  # [N - 1, 2, P]
-    change = law.threshold_on * counts[:, 0] - law.threshold_off * counts[:, 1]
+    change = _said(counts, law)
     level = np.concatenate([np.zeros((1, change.shape[1])), np.cumsum(change, axis=0)])
     level = gaussian_filter(level.reshape(-1, *shape), (0, _BLUR_PX, _BLUR_PX))
-    ambient = reduce_by_area(setup.ambient_light((events.height, events.width)).numpy(), shape)
-    light = ambient * np.expm1(np.clip(level - np.quantile(level, _RESTS, axis=0), -3.0, 3.0))
+    light = reduce_by_area(ambient, shape) * np.expm1(
+        np.clip(level - np.quantile(level, _RESTS, axis=0), -3.0, 3.0)
+    )
     peak = light.max(axis=(1, 2))
     if not float(peak.max()) > 0:
         raise DataError(
@@ -322,9 +334,7 @@ class EventFit:
         self._setup, self._reach, self._size_m, self._shape = setup, reach, size_m, shape
         note("light of the setup")
         self._lights = Lights(setup, strip_of(reach, plane), coarse, depth, rank=_RANK)
-        down, across = (spline_matrix(*sizes) for sizes in zip(coarse, shape, strict=True))
-        basis = self._lights.basis.numpy().reshape(*coarse, -1)
-        self._left = np.einsum("yi,xj,ijr->yxr", down, across, basis, optimize=True).reshape(-1, basis.shape[2])
+        self._left = on_pixels(self._lights.basis.numpy(), coarse, shape)
         self._nodes = np.linspace(times_s[0], times_s[-1], max(_NODES, _PER_KNOT * len(times_s)))
         self._share = np.asarray(CubicSpline(times_s, np.eye(len(times_s)))(self._nodes))  # [T, N]
         self._ramp = np.linspace(-1.0, 1.0, len(self._nodes))
@@ -360,13 +370,10 @@ class EventFit:
         self, path: EventPath, record: EventRecord, law: CrossingLaw, width: int
     ) -> tuple[EventPath, Array]:
         """Return the path after all rounds, and the covariance of all unknowns."""
-        row, column = np.divmod(record.pixel, width)
         strides = [one for one in _STRIDES if one[0] == 1 or len(self._left) >= _FEWEST_PIXELS * one[0] ** 2]
         covariance, number = np.zeros((0, 0)), 0
         for stride, most in strides:
-            kept = (row % stride == 0) & (column % stride == 0)
-            own = record.of_pixels(kept)
-            own = replace(own, pixel=row[kept] // stride * -(-width // stride) + column[kept] // stride)
+            own = record.every(stride, width)
             for _ in range(most):
                 note(f"path and target from the events, round {number + 1}, every {stride}. row and column")
                 light = self.light(path).every(stride, _RANK)
@@ -398,7 +405,7 @@ class EventFit:
         bright = light(np.append(path.z, np.zeros(len(covariance) - known)))[:, at]
         made = np.diff(np.log(np.maximum(bright, _DARK)), axis=1).T.reshape(-1, *self._shape)
         made = reduce_by_area(made, shape).reshape(len(counts), -1)
-        said = law.threshold_on * counts[:, 0] - law.threshold_off * counts[:, 1]
+        said = _said(counts, law)
         share = float((said * made).sum()) ** 2 / max(float((said**2).sum() * (made**2).sum()), 1e-300)
         free = len(covariance) - float(np.diag(covariance)[:known].sum())  # the prior decides the rest
         return share, free / said.size
