@@ -157,5 +157,10 @@ def test_the_command_follows_events_where_frames_are_left_out_or_absent(capture,
     with pytest.raises(SystemExit):
         main(["track", str(folder.parent / "alone"), "--out", str(tmp_path / "p.png")])
     assert "events alone need a setup to be followed; give one (--setup)" in capsys.readouterr().err
+    for words in ([str(folder), "--no-frames"], [str(folder.parent / "alone")]):
+        with pytest.raises(SystemExit):
+            main(["track", *words, "--setup", str(setup), "--targets", "2", "--out", str(tmp_path / "p.png")])
+        assert "Tracking.targets is 2; several are found by frames alone" in capsys.readouterr().err
+    assert not (tmp_path / "p.png").exists()
     main(["track", str(folder.parent / "alone"), "--setup", str(setup), "--out", str(tmp_path / "a.png")])
     assert " events alone" in capsys.readouterr().out

@@ -123,13 +123,17 @@ def track_several(
         pattern: The frame camera's fixed pattern, to be taken off first.
 
     Raises:
-        ConfigError: There is no setup, or depth or turning is asked for.
+        ConfigError: There is no setup, there are no frames, or depth or turning is asked for.
         DataError: Too few frames.
     """
     if setup is None:
         raise ConfigError(f"Tracking.targets is {settings.targets} and needs a setup: give its file (--setup)")
     if settings.depth or settings.turning:
         raise ConfigError(f"Tracking.targets is {settings.targets}; depth and turning are found of one alone")
+    if not (capture.has_frames and settings.frames):
+        raise ConfigError(
+            f"{capture.name}: Tracking.targets is {settings.targets}; several are found by frames alone"
+        )
     small = reduced(_levels(capture, pattern), settings.most_columns)
     times_s, noise = capture.frame_times_us.astype(np.float64) * 1e-6, temporal_noise(small)
     if not noise > 0:
