@@ -597,6 +597,28 @@ def test_the_command_takes_a_calibrated_folder_and_says_what_no_capture_is(captu
         assert said in capsys.readouterr().err
 
 
+def _dot(motion: PathMotion) -> Scene:
+    return Scene(Target("dot", np.ones((2, 2), dtype=np.float32), 0.01), motion, 8.0)
+
+
+def test_errors_of_a_track_are_those_about_the_mean() -> None:
+    times, ones = np.linspace(0, 8, 9), np.ones(9)
+    path = np.stack([0.02 * times, np.zeros(9)], axis=1)
+    sway = 0.001 * np.array([1, -1, 1, -1, 0, 1, -1, 1, -1.0])
+    scene = _dot(PathMotion(tuple(times), tuple(map(tuple, path)), 0.3, tuple(3 * times)))
+    seen, rates = path + [0.004, 0] + sway[:, None] * [0, 1], np.gradient(path, times, axis=0)
+    away, turn = Distance(times, 0.31 + sway, ones, ones, ones), Turn(times, 3 * times + sway, ones, ones, ones)
+    track = Track(times, seen, rates, path, path, "m", times, path, path, ones, ones, 0, away, turn)
+    found = track.errors(scene)
+    assert found["position_offset"] == pytest.approx([0.004, 0])
+    rms = float(np.sqrt(np.mean(np.square(sway))))
+    assert [found[name] for name in ("position_error", "distance_error", "turn_error_deg")] == pytest.approx(
+        [rms] * 3
+    )
+    own = _dot(PathMotion(tuple(times), tuple(map(tuple, path))))  # at the setup's own distance: a constant one
+    assert track.errors(own)["distance_error"] == pytest.approx(rms)
+
+
 def test_no_line_of_the_speed_lies_on_the_frame(tmp_path, monkeypatch) -> None:
     pytest.importorskip("matplotlib")
     from matplotlib.figure import Figure
@@ -607,7 +629,7 @@ def test_no_line_of_the_speed_lies_on_the_frame(tmp_path, monkeypatch) -> None:
     path = np.stack([0.02 * times, np.zeros(9)], axis=1)
     sigma, ones = np.full((9, 2), 1e-9), np.ones(9)
     track = Track(times, path, path * 0 + [0.0199, 0], sigma, sigma, "m", times, path, sigma, ones, 0 * ones, 0)
-    draw_track(track, tmp_path / "t.png", path)
+    draw_track(track, tmp_path / "t.png", _dot(PathMotion(tuple(times), tuple(map(tuple, path)))))
     (speed,) = [axes for axes in drawn[0].axes if axes.get_title() == "speed"]
     low, high = speed.get_ylim()
     assert low == 0 and high > 1.05 * 2.0
@@ -627,7 +649,12 @@ def test_a_track_has_a_panel_for_each_course_that_was_found(several, tmp_path, m
     if not several:
         turn = Turn(times, 3 * times, ones, ones, ones)
         track = replace(track, distance=Distance(times, 0.3 + 0 * times, 0.01 * ones, ones, ones), turn=turn)
-    draw_track(track, tmp_path / "t.png")
+    knots, points = tuple(times), tuple(map(tuple, path))
+    scene = _dot(PathMotion(knots, points, tuple(np.linspace(0.29, 0.31, 9)), tuple(10 + 4 * times)))
+    draw_track(track, tmp_path / "t.png", scene)
+    for title, line in (("distance from the wall", [29, 31]), ("turn about its mean", [-16, 16])):
+        shown = [axes.lines[-1].get_ydata() for axes in drawn[0].axes if axes.get_title() == title]
+        assert all(y[[0, -1]] == pytest.approx(line) for y in shown) and len(shown) == (not several)
     titles = [axes.get_title() for axes in drawn[0].axes if axes.axison]
     more = [] if several else ["distance from the wall", "turn about its mean"]
     assert titles == ["path", "position", "speed", *more]

@@ -380,12 +380,12 @@ def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool, warni
     rows, pictures = [], []
     for k, track in enumerate(found.tracks):
         known = [] if capture.scene is None else [capture.scene, *capture.others]
-        truths = [(one.target.name, one.light_m(track.time_s)) for one in known]
-        nearest = min(truths, key=lambda one: float(np.square(one[1] - track.position).sum()), default=None)
-        rows.append(track_values(capture, track, None if nearest is None else nearest[1]))
-        rows[-1]["target"] = None if nearest is None else nearest[0]
+        off = [float(np.square(one.light_m(track.time_s) - track.position).sum()) for one in known]
+        nearest = known[int(np.argmin(off))] if known else None
+        rows.append(track_values(capture, track, nearest))
+        rows[-1]["target"] = None if nearest is None else nearest.target.name
         path, title = out.with_stem(f"{out.stem}_{k + 1}"), f"{capture.name}, object {k + 1}"
-        pictures.append(drawn(path, partial(draw_track, track, path, nearest and nearest[1], title)))
+        pictures.append(drawn(path, partial(draw_track, track, path, nearest, title)))
     if found.tracks:
         panels = [(f"object {k + 1}", torch.from_numpy(one)[None]) for k, one in enumerate(found.images)]
         path = out.with_stem(f"{out.stem}_images")

@@ -23,11 +23,10 @@ from evnlos.tracking import Tracking
 from evnlos.types import OutFile, OutFolder, OutImage, length_text
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from evnlos.analysis import Identification
     from evnlos.data import Capture
     from evnlos.data.lab import Lab
+    from evnlos.scene import Scene
     from evnlos.tracking import Track
 
 
@@ -174,10 +173,10 @@ class TrackCommand:
             odd = track_warnings(capture, setup, track.tracks[0]) if track.tracks else []
             show_tracks(capture, track, self.out, self.json, odd)
             return
-        truth = None if track.unit != "m" or capture.scene is None else capture.scene.light_m(track.time_s)
-        found = track_values(capture, track, truth)
+        scene = capture.scene if track.unit == "m" else None
+        found = track_values(capture, track, scene)
         found["warnings"] = track_warnings(capture, setup, track)
-        found["picture"] = drawn(self.out, lambda: draw_track(track, self.out, truth, capture.name))
+        found["picture"] = drawn(self.out, lambda: draw_track(track, self.out, scene, capture.name))
         if track.image is not None:
             save_arrays(image_path, {"image": track.image})
             panels = [("found", from_numpy(track.image)[None])]
@@ -191,7 +190,7 @@ class TrackCommand:
             say(f"warning: {warning}")
 
 
-def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -> dict[str, Any]:
+def track_values(capture: Capture, track: Track, scene: Scene | None) -> dict[str, Any]:
     """Return what the command prints: means, and errors where the truth is known."""
     step = track.position[-1] - track.position[0]
     found: dict[str, Any] = {
@@ -221,14 +220,7 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
         found["turn_deg"] = float(track.turn.rotation_deg[-1] - track.turn.rotation_deg[0])
         found["turn_sigma_deg"] = float(track.turn.rotation_sigma.mean())
         found["turn_identified"] = track.turn.is_identified
-    if truth is not None:
-        error = track.position - truth
-        speed = np.linalg.norm(np.gradient(truth, track.time_s, axis=0), axis=1)
-        slow = np.sqrt(np.mean(np.square(track.speed - speed)) / np.mean(np.square(speed)))
-        found["position_offset"] = error.mean(axis=0).tolist()
-        found["position_error"] = float(np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean()))
-        found["speed_error_percent"] = float(100 * slow)
-    return found
+    return found if scene is None else found | track.errors(scene)
 
 
 def to_text(found: dict[str, Any]) -> str:
@@ -268,6 +260,8 @@ def to_text(found: dict[str, Any]) -> str:
         lines.append(
             f"error       {length('position_error', 3):>11} rms about an offset of ({x}, {y}); "
             f"speed {found['speed_error_percent']:.2f} % rms"
+            + (f", distance {length('distance_error')} rms about its own" if "distance_error" in found else "")
+            + (f", turn {found['turn_error_deg']:.2f} deg rms" if "turn_error_deg" in found else "")
         )
     if "image" in found:
         known = found["psnr_db"]

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from evnlos.calibration import SetupFit
 from evnlos.files import write_atomically
 from evnlos.plot.figures import new_figure, save_figure, signed_map
+from evnlos.scene import Scene
 from evnlos.setups.files import Measurement
 from evnlos.tracking import Track
 from evnlos.untrusted import open_image
@@ -190,18 +191,16 @@ def _spectrum(matrix: torch.Tensor) -> np.ndarray:
     return torch.linalg.eigvalsh(gram).flip(0).clamp(min=0).sqrt().numpy()
 
 
-_HEADROOM = 1.1  # of the speed's axis over the largest speed, so that no line lies on the frame
+_TRUE: dict[str, Any] = {"linestyle": "--", "color": "k", "linewidth": 1}
 
 
-def draw_track(
-    track: Track, path: str | Path, truth: NDArray[np.float64] | None = None, title: str = ""
-) -> Path:
+def draw_track(track: Track, path: str | Path, scene: Scene | None = None, title: str = "") -> Path:
     """Draw path, coordinates, speed, and distance, turn or size over time, with bands of two deviations.
 
     Args:
         track: The track.
         path: The image, PNG or SVG.
-        truth: The true position (x, y) at the track's instants, [T, 2], in its unit, where it is known.
+        scene: The truth, where it is known; of a track in metres.
         title: Heading of the figure.
 
     Returns:
@@ -211,41 +210,45 @@ def draw_track(
         MissingDependencyError: matplotlib is not installed.
     """
     scale, unit = (100.0, "cm") if track.unit == "m" else (1.0, "px")
-    curves: list[tuple[Any, Any, Any, str, str]] = []
+    curves: list[tuple[Any, Any, Any, Any, str, str]] = []
     if (away := track.distance) is not None:
+        true = None if scene is None else scale * away.true_m(scene)
         seen = scale * away.distance_m, scale * away.distance_sigma
-        curves.append((away.time_s, *seen, f"distance, {unit}", "distance from the wall"))
+        curves.append((away.time_s, *seen, true, f"distance, {unit}", "distance from the wall"))
     if (turn := track.turn) is not None:
-        curves.append((turn.time_s, turn.rotation_deg, turn.rotation_sigma, "degrees", "turn about its mean"))
+        true = None if scene is None else turn.true_deg(scene)
+        seen = turn.rotation_deg, turn.rotation_sigma
+        curves.append((turn.time_s, *seen, true, "degrees", "turn about its mean"))
     if not curves and np.isfinite(track.size).any():
-        curves.append((track.frame_time_s, track.size, track.size_sigma, "over its mean", "size of the image"))
+        curves.append((track.frame_time_s, track.size, track.size_sigma, None, "over its mean", "image size"))
     figure = new_figure((16.5 if len(curves) > 1 else 11.0, 6.4))
     plane, along, speed, *rest = figure.subplots(2, 2 + len(curves) // 2).flat
     figure.suptitle(title)
     by = "events" if track.events else "frames"
     plane.plot(*(scale * track.frame_position.T), ".", color="0.6", label=by)
     plane.plot(*(scale * track.position.T), color="C0", label="track")
-    if truth is not None:
-        plane.plot(*(scale * truth.T), "--", color="k", linewidth=1, label="truth")
-    plane.set(xlabel=f"x, {unit}", ylabel=f"y, {unit} (downwards)", title="path")
-    plane.invert_yaxis()
-    plane.set_aspect("equal", adjustable="datalim")
-    plane.legend()
     for axis, (middle, sigma) in enumerate(zip(track.position.T, track.position_sigma.T, strict=True)):
         _band(along, track.time_s, scale * middle, scale * sigma, f"C{axis}", "xy"[axis])
-    if truth is not None:
-        along.plot(track.time_s, scale * truth, "--", color="k", linewidth=1)
+    top = _band(speed, track.time_s, scale * track.speed, scale * track.speed_sigma, "C2")
+    if scene is not None:
+        truth = scale * scene.light_m(track.time_s)
+        fast = np.linalg.norm(np.gradient(truth, track.time_s, axis=0), axis=1)
+        top = max(top, float(fast.max()))
+        plane.plot(*truth.T, **_TRUE, label="truth")
+        along.plot(track.time_s, truth, **_TRUE)
+        speed.plot(track.time_s, fast, **_TRUE)
+    plane.set(xlabel=f"x, {unit}", ylabel=f"y, {unit} (downwards)", title="path", aspect="equal")
+    plane.set(adjustable="datalim")
+    plane.invert_yaxis()
+    plane.legend()
     along.set(xlabel="time, s", ylabel=f"position, {unit}", title="position")
     along.legend()
-    top = _band(speed, track.time_s, scale * track.speed, scale * track.speed_sigma, "C2")
-    if truth is not None:
-        true = scale * np.linalg.norm(np.gradient(truth, track.time_s, axis=0), axis=1)
-        top = max(top, float(true.max()))
-        speed.plot(track.time_s, true, "--", color="k", linewidth=1)
-    # An upper end of None would stay where it stood before and cut a band that has just been drawn.
-    speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, _HEADROOM * top or None))
-    for axes, (time_s, middle, sigma, name, heading) in zip(rest, curves, strict=False):
+    # A tenth more than the largest, so that no line lies on the frame; set last, as what is drawn later is cut.
+    speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, 1.1 * top or None))
+    for axes, (time_s, middle, sigma, true, name, heading) in zip(rest, curves, strict=False):
         _band(axes, time_s, middle, sigma, "C3")
+        if true is not None:
+            axes.plot(time_s, true, **_TRUE)
         axes.set(xlabel="time, s", ylabel=name, title=heading)
     for axes in rest[len(curves) :]:
         axes.set_axis_off()

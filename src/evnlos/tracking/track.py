@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.data.capture import Capture
 from evnlos.errors import DataError
+from evnlos.scene import Scene
 from evnlos.setups import Setup
 
 _LIKELY = np.logspace(-3, 3, 25)  # of (spread of the positions / duration^1.5)^2
@@ -169,6 +170,10 @@ class Distance:
         known = float((self.distance_sigma / self.distance_m).mean()) < _KNOWN_DISTANCE
         return known and float(self.distance_m.std()) > float(self.distance_sigma.mean())
 
+    def true_m(self, scene: Scene) -> NDArray[np.float64]:
+        """Return the true distance, [N], metres; of a scene at the setup's own distance that of this mean."""
+        return np.nan_to_num(scene.pose(self.time_s).z_m, nan=float(self.distance_m.mean()))
+
 
 @dataclass(frozen=True, eq=False)
 class Turn:
@@ -192,6 +197,11 @@ class Turn:
     def is_identified(self) -> bool:
         """Whether the turn is known within 5 degrees: that of a round target never is."""
         return float(self.rotation_sigma.mean()) < _KNOWN_TURN_DEG
+
+    def true_deg(self, scene: Scene) -> NDArray[np.float64]:
+        """Return the true turn about its mean, [N], degrees."""
+        turn = np.degrees(scene.pose(self.time_s).rotation_rad)
+        return turn - turn.mean()
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,26 +293,29 @@ class Track:
         bend = step * (self.velocity[k] * u * (1 - u) ** 2 - self.velocity[k + 1] * u**2 * (1 - u))
         return self.position[k] + rise * u**2 * (3 - 2 * u) + bend
 
+    def errors(self, scene: Scene) -> dict[str, Any]:
+        """Return how far a track in metres is from the truth: rms about the mean error, which is the offset.
+
+        Args:
+            scene: The target and its motion.
+        """
+        true = scene.light_m(self.time_s)
+        error = self.position - true
+        speed = np.linalg.norm(np.gradient(true, self.time_s, axis=0), axis=1)
+        slow = np.sqrt(np.mean(np.square(self.speed - speed)) / np.mean(np.square(speed)))
+        found = {"position_offset": error.mean(axis=0).tolist(), "speed_error_percent": float(100 * slow)}
+        found["position_error"] = float(np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean()))
+        if self.distance is not None:
+            found["distance_error"] = float(np.std(self.distance.distance_m - self.distance.true_m(scene)))
+        if self.turn is not None:
+            found["turn_error_deg"] = float(np.std(self.turn.rotation_deg - self.turn.true_deg(scene)))
+        return found
+
     def summary(self) -> dict[str, Any]:
         """Return everything as plain lists and numbers, for JSON."""
-        arrays = {
-            name: np.round(getattr(self, name), 7).tolist()
-            for name in (
-                "time_s",
-                "position",
-                "velocity",
-                "position_sigma",
-                "velocity_sigma",
-                "speed",
-                "speed_sigma",
-                "direction_deg",
-                "frame_time_s",
-                "frame_position",
-                "frame_sigma",
-                "size",
-                "size_sigma",
-            )
-        }
+        courses = "time_s position velocity position_sigma velocity_sigma speed speed_sigma direction_deg"
+        names = f"{courses} frame_time_s frame_position frame_sigma size size_sigma".split()
+        arrays = {name: np.round(getattr(self, name), 7).tolist() for name in names}
         if np.isnan(self.size).any():
             arrays = {name: values for name, values in arrays.items() if not name.startswith("size")}
         found = {"unit": self.unit, "event_windows": self.event_windows, **arrays}
