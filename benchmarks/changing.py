@@ -1,6 +1,7 @@
 """How much better is a film of a hidden plane that changes than the best image of something rigid?
 
     python benchmarks/changing.py [SEED...]    # of several seeds the mean, and the standard error of the gain
+    python benchmarks/changing.py events       # from events, and from few frames with events between them
 
 Rough aluminium at 0.3 m, 32 x 48 pixels, a plane of 10 cm, 6 s at 10 frames per second, noise of the default
 frame camera with its fixed pattern taken off, ambient light 0.05. The wall is rendered from cells of 1.6 mm
@@ -13,6 +14,9 @@ Tikhonov image of the mean frame; "rigid" one image that moves along the true pa
 best by the truth. "limit" is the mean of the true film: nothing that rests does better. "film"
 (`estimate_film`) sees the frames alone; "covered" is the share of its cells that lie within the stated 90 %
 intervals; "film over rigid" is over the better one of "static" and "rigid".
+
+`events`: seed 0, a pixel with thresholds of 0.2 (spread 0.03), 0.1 noise events per second. "few frames" is the
+film of 2 frames per second, on a line between them; "few frames, events" the one estimate of both.
 """
 
 import sys
@@ -23,8 +27,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.cameras import FrameCamera
-from evnlos.inverse import Gradient, Problem, SequenceOperator, SequenceProblem, estimate_film
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera
+from evnlos.inverse import (
+    FilmEstimate,
+    FilmFrames,
+    Gradient,
+    Problem,
+    SequenceOperator,
+    SequenceProblem,
+    estimate_event_film,
+    estimate_film,
+    record_of,
+)
 from evnlos.inverse.sequence_problem import matrix_of, strip_of
 from evnlos.inverse.tikhonov import Spectrum
 from evnlos.metrics import psnr
@@ -122,8 +136,11 @@ def compare(name: str, seed: int, roughness: float) -> dict[str, float]:
     sight = SequenceOperator(strip, COARSE, places)
     problem = SequenceProblem(sight, 1.0)
 
+    assert isinstance(strip.source, Plane)
+    plane = strip.source
+
     def rigid(weight: float) -> torch.Tensor:
-        return on_plane(sight.drawn(problem.tikhonov(light, weight).image), strip.source)
+        return on_plane(sight.drawn(problem.tikhonov(light, weight).image), plane)
 
     others = [coarse(FILMS[other]().at(times)).mean(dim=0) for other in FILMS if other != name]
     found = estimate_film(operator, light, times, noise)
@@ -137,6 +154,48 @@ def compare(name: str, seed: int, roughness: float) -> dict[str, float]:
         "film": decibel(torch.from_numpy(found.mean), truth),
         "covered": float(((truth >= low) & (truth <= high)).double().mean()),
     }
+
+
+PIXEL = EventPixel(0.2, 0.2, threshold_sigma=0.03, cutoff_hz=100, leak_rate_hz=0, shot_noise_rate_hz=0.1)
+FEW = slice(0, None, 5)
+
+
+def compare_events(name: str, seed: int, roughness: float) -> list[str]:
+    """Return PSNR, dB, and coverage of films from frames, events, few frames, and few frames with events."""
+    setup = RadiometricSetup(roughness=roughness, strip_m=(0.1, 0.1), ambient=AMBIENT).resized(SHAPE)
+    wall = FilmWall(operator_of(setup, FINE), film := FILMS[name](), ambient=setup.ambient_light())
+    times = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ + 0.02
+    span = float(times[0]), float(times[-1])
+    camera, law, still = (
+        FrameCamera(exposure_s=0.016, prnu=0, dsnu_e=0),
+        PIXEL.known_law(30.0),
+        setup.ambient_light(),
+    )
+    events = EventCamera(PIXEL).record(wall, *span, seed=seed)
+    frames = torch.from_numpy(camera.capture(wall, times, seed).astype(np.float64) / camera.white)
+    noise, light = camera.noise_variance(frames.mean(dim=0)).sqrt(), frames - still.double()
+    truth, operator, record = (
+        coarse(film.at(times)),
+        operator_of(setup, COARSE),
+        record_of(events, law, span, 0.4),
+    )
+
+    def told(found: FilmEstimate) -> str:
+        low, high = (torch.from_numpy(bound) for bound in found.interval())
+        covered = float(((truth >= low) & (truth <= high)).double().mean())
+        return f"{decibel(torch.from_numpy(found.mean), truth):.2f}, {100 * covered:.0f} %"
+
+    few = estimate_film(operator, light[FEW], times[FEW], noise)
+    between = [np.interp(times, times[FEW], cell) for cell in few.mean.reshape(len(few.mean), -1).T]
+    beside = FilmFrames(operator, light[FEW], times[FEW], noise * few.noise_factor, few.static)
+    seen = operator, still, record, law, times
+    return [
+        f"{len(events) / still.numel():.1f}",
+        told(estimate_film(operator, light, times, noise)),
+        told(estimate_event_film(*seen)),
+        f"{decibel(torch.from_numpy(np.stack(between, axis=1)).reshape(truth.shape), truth):.2f}",
+        told(estimate_event_film(*seen, frames=beside, prior=few.prior)),
+    ]
 
 
 def on_plane(strips: torch.Tensor, strip: Plane) -> torch.Tensor:
@@ -158,6 +217,13 @@ def row(name: str, runs: list[dict[str, float]]) -> str:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
+    if sys.argv[1:] == ["events"]:
+        print("| | events per pixel | frames | events | few frames | few frames, events |\n|" + "---|" * 6)
+        for wall_roughness in (0.05, 0.02):
+            for film_name in FILMS:
+                cells = compare_events(film_name, 0, wall_roughness)
+                print(f"| {film_name}, roughness {wall_roughness:g} | {' | '.join(cells)} |", flush=True)
+        sys.exit()
     print("| | blind | static | rigid | limit | frame by frame | film | film over rigid | covered |")
     print("|" + "---|" * 9)
     seeds = [int(word) for word in sys.argv[1:]] or [0]

@@ -26,7 +26,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-MODULES = ("matplotlib", "gradio", "av", "aedat", "mitsuba", "lz4", "zstandard", "dask", "fontpkg", "pytest")
+MODULES = ("matplotlib", "gradio", "av", "aedat", "lz4", "zstandard", "dask", "fontpkg", "pytest")
 SETTINGS = """
 glyphs: {kind: drawings, kinds: [icon, person], each: 4}
 setup: {kind: radiometric, cell_m: 0.01, gain: 0.7, ambient: 0.06, sensor: {height: 48, width: 72}}

@@ -14,7 +14,7 @@ import pytest
 import evnlos
 
 SOURCE = Path(evnlos.__file__).parent
-FORBIDDEN = {"torchvision", "matplotlib", "gradio", "dask", "distributed", "scipy", "pandas", "cv2", "mitsuba"}
+FORBIDDEN = {"torchvision", "matplotlib", "gradio", "dask", "distributed", "scipy", "pandas", "cv2"}
 CORE = {
     "PIL",
     "evnlos",
@@ -130,7 +130,9 @@ WHOLE_CHAPTERS = {
     "events/batch.py",
     "events/files/aedat.py",
     "inverse/corner.py",
+    "inverse/event_likelihood.py",
     "lab/light_path.py",
+    "models/posterior.py",
     "models/sequence.py",
     "optics/corner.py",
     "optics/facets.py",
@@ -199,7 +201,7 @@ WITHOUT_ARGS = {
 """Functions whose file has no line left for their arguments; may only shrink."""
 
 
-OFFERED = (*STAGES, "calibration.scan", "interop", "live", "metrics", "studies", "tensor_file")
+OFFERED = (*STAGES, "calibration.scan", "live", "metrics", "studies", "tensor_file")
 
 
 @pytest.mark.parametrize("room", OFFERED)

@@ -9,15 +9,25 @@ import torch
 import yaml
 from PIL import Image
 
-from evnlos.cameras import FrameCamera
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
-from evnlos.inverse import FilmPrior, Gradient, estimate_film, smooth_modes
+from evnlos.inverse import (
+    FilmFrames,
+    FilmPrior,
+    Gradient,
+    NormalEquations,
+    estimate_event_film,
+    estimate_film,
+    record_of,
+    smooth_modes,
+)
+from evnlos.inverse.event_film import FilmLight, FilmRows, film_equations
 from evnlos.optics import FilmWall, MatrixTransport
 from evnlos.scene import Film, closing_hand
 from evnlos.setups import load_setup
-from evnlos.types import Events, Plane
+from evnlos.types import Plane
 
 PLANE = Plane(4, 5, 0.01)
 TIMES = np.array([0.0, 0.1, 0.2, 0.35, 0.4, 0.6])
@@ -195,6 +205,70 @@ def test_what_does_not_fit_is_refused() -> None:
         FilmWall(operator, Film(np.zeros((1, 3, 3)), [0.0]))
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.1])
+def test_sums_over_the_nodes_are_those_of_whole_rows(spread: float) -> None:
+    """Slow reference: each row as a vector over all nodes and modes."""
+    rng = np.random.default_rng(5)
+    pixels, nodes, modes, count = 300, 6, 3, 900
+    light = FilmLight.of(draw(pixels, modes), np.ones(pixels), np.arange(nodes) / 10, (20, 15))
+    pixel, group = np.sort(rng.integers(0, pixels, count)), rng.integers(-1, 2, count)
+    group = np.where(group < 0, -1, 2 * pixel + group)
+    pixel, group = (column[np.lexsort((group, pixel))] for column in (pixel, group))
+    node, slope = rng.integers(0, nodes - 1, (count, 2)), draw(count, 4, seed=1)
+    weight, residual = rng.uniform(0.5, 2, count), draw(count, seed=2)
+    found = film_equations(FilmRows(pixel, node, slope, weight, residual, group), light, spread)
+    tau = np.zeros((count, nodes))
+    for k, at in enumerate((node[:, 0], node[:, 0] + 1, node[:, 1], node[:, 1] + 1)):
+        np.add.at(tau, (np.arange(count), at), slope[:, k])
+    rows = (tau[:, :, None] * light.left[pixel][:, None]).reshape(count, -1)
+    whole, own = NormalEquations.empty(nodes * modes), group >= 0
+    whole.add(rows[~own], weight[~own], residual[~own], group[~own], 0.0)
+    whole.add(rows[own], weight[own], residual[own], group[own], spread)
+    assert found.information == pytest.approx(whole.information, abs=1e-4)
+    assert found.score == pytest.approx(whole.score, abs=1e-9)
+
+
+def test_events_tell_a_film_and_frames_beside_them_more() -> None:
+    """Two lights that brighten and fade in turn."""
+    plane, shape, times = Plane(5, 5, 0.02), (12, 16), np.linspace(0, 3, 31)
+    y, x = (a.ravel() for a in np.meshgrid(plane.y_m, plane.x_m, indexing="ij"))
+    rows, columns = (
+        a.ravel() for a in np.meshgrid(*(np.linspace(-0.06, 0.06, n) for n in shape), indexing="ij")
+    )
+    far = np.square(rows[:, None] - y) + np.square(columns[:, None] - x)
+    operator = MatrixTransport(torch.from_numpy(0.05 * np.exp(-far / 2 / 0.02**2)), plane, shape)
+    strength = 0.5 + 0.5 * np.sin(2 * np.pi * times / 1.5)
+    images = np.zeros((31, 5, 5), np.float32)
+    images[:, :, :2], images[:, 1:4, 3:] = strength[:, None, None], 1 - strength[:, None, None]
+    still = torch.full(shape, 0.1, dtype=torch.float64)
+    wall = FilmWall(operator, Film(images, times), ambient=still)
+    pixel = EventPixel(0.1, 0.1, threshold_sigma=0.01, cutoff_hz=0, leak_rate_hz=0, shot_noise_rate_hz=0.05)
+    law = pixel.known_law(30.0)
+    record = record_of(EventCamera(pixel).record(wall, 0.0, 3.0, seed=1), law, (0.0, 3.0), 0.4)
+    camera = FrameCamera(prnu=0, dsnu_e=0)
+    seen = torch.from_numpy(camera.capture(wall, times, 1) / camera.white) - still
+    noise = camera.noise_variance(seen.mean(dim=0) + still).sqrt()
+    frames = FilmFrames(operator, seen[::3], times[::3], noise, 0.0)
+    alone = estimate_film(operator, seen[::3], times[::3], noise)
+    each = {
+        "events": estimate_event_film(operator, still, record, law, times),
+        "both": estimate_event_film(operator, still, record, law, times, frames=frames, prior=alone.prior),
+    }
+    error = {name: float(np.square(one.mean - images).mean()) for name, one in each.items()}
+    between = np.stack([np.interp(times, times[::3], one) for one in alone.mean.reshape(11, -1).T], axis=1)
+    assert error["events"] < 0.35 * np.square(images - images.mean(axis=0)).mean()
+    assert error["both"] < min(error["events"], float(np.square(between.reshape(images.shape) - images).mean()))
+    for one in each.values():  # sharp edges, of which the prior knows nothing
+        low, high = one.interval()
+        assert ((images >= low) & (images <= high)).mean() > 0.75
+    with pytest.raises(DataError):
+        estimate_event_film(operator, still, record, law, times**2)
+    with pytest.raises(DataError):
+        estimate_event_film(operator, still[:5], record, law, times)
+    with pytest.raises(DataError):
+        estimate_event_film(operator, still, record, law, np.linspace(0, 3, 400))
+
+
 def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = {
         "kind": "radiometric",
@@ -216,7 +290,7 @@ def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.Ca
         Image.fromarray(frame).save(folder / f"{k}.png")
         table.append(f"{round(1e6 * times[k])},{k}.png")
     (folder / "frames.csv").write_text("\n".join(table))
-    write_events(folder / "events.npz", Events([0, 1_100_000], [0, 1], [0, 1], [True, False], 32, 20))
+    write_events(folder / "events.npz", EventCamera(setup.pixel).record(wall, 0.0, 1.1, seed=1))
     about = {"camera": {"name": "simulated", "width": 32, "height": 20}, "events": "events.npz"}
     (folder / "capture.yaml").write_text(yaml.safe_dump(about))
     words = ["invert", str(folder), "--setup", str(tmp_path / "setup.yaml"), "--changing", "0.1", "0.1"]
@@ -236,3 +310,11 @@ def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.Ca
     assert inside.mean() > 0.85
     with pytest.raises(SystemExit):
         main([*words, "--track"])
+    for source in ("events", "both"):
+        out = ["--cells", "16", "--from", source, "--out", str(tmp_path / f"{source}.png"), "--json"]
+        main([*words, *out])
+        seen = json.loads(capsys.readouterr().out)
+        assert (seen["from"], seen["images"], seen["evidence"]) == (source, 12, None)
+        course = np.load(tmp_path / f"{source}.npz")["film"]
+        changes = (course - course.mean(axis=0)).ravel()
+        assert np.corrcoef(changes, rest.ravel())[0, 1] > 0.6

@@ -208,6 +208,26 @@ def test_a_capture_is_begun_without_any_library(tmp_path) -> None:
     assert not set(HEAVY) & set(modules.split())
 
 
+def test_help_in_a_thread_gives_no_other_thread_a_library_that_is_none() -> None:
+    """A command's help is printed without the work's libraries; what another thread imports is whole."""
+    script = """
+import threading
+from evnlos.cli import main
+def ask():
+    try:
+        main(["train", "--help"])
+    except SystemExit:
+        pass
+asking = threading.Thread(target=ask)
+asking.start()
+import numpy
+asking.join()
+print("evnlos.doctor" not in type(numpy.ndarray).__module__, numpy.arange(3).sum())
+"""
+    told = subprocess.check_output([sys.executable, "-c", script], text=True)
+    assert told.splitlines()[-1] == "True 3"
+
+
 def test_what_stands_in_for_a_library_cannot_be_gone_through() -> None:
     """A show's order of patterns is drawn while its command is described: a loop over it took all memory."""
     code = (

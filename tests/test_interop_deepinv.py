@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from evnlos.errors import DataError, MissingDependencyError
-from evnlos.interop import as_physics
-from evnlos.inverse import tikhonov
+from evnlos.inverse import as_physics, tikhonov
 from evnlos.optics import MatrixTransport
 from transports import EXAMPLES
 

@@ -159,3 +159,10 @@ def test_metrics_know_the_same_and_the_worse_and_batches(metric, best: float) ->
 
 def test_haarpsi_of_two_empty_images_is_one() -> None:
     assert haarpsi(torch.zeros(16, 16), torch.zeros(16, 16)).item() == 1.0
+
+
+def test_peaks_and_windows_that_are_none_are_refused() -> None:
+    image = torch.linspace(0, 1, 256).reshape(16, 16)
+    for call in (lambda: psnr(image, image, peak=0), lambda: ssim(image, image, window=10)):
+        with pytest.raises(EvnlosError):
+            call()

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.interop import trace, triangulate, usable_variant
 from evnlos.optics import GGX, Lambert, Occluder, View, light_transport_matrix
 from evnlos.setups import RadiometricSetup
 from evnlos.types import Plane
@@ -18,7 +17,10 @@ from mitsuba_oracle import (
     Agreement,
     compare,
     pattern,
+    trace,
     trace_setup,
+    triangulate,
+    usable_variant,
     wall_image,
 )
 

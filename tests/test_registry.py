@@ -7,9 +7,11 @@ from typing import Literal
 import pytest
 
 from evnlos import registry as rooms
+from evnlos.cameras import EventPixel
 from evnlos.config import from_dict, to_dict
 from evnlos.errors import ConfigError
 from evnlos.registry import Kinded, Registry, migrate
+from evnlos.setups import PaperSetup
 
 
 class Shape(Kinded):
@@ -101,3 +103,44 @@ def test_two_classes_cannot_have_one_kind() -> None:
 def test_values_of_today_are_not_touched() -> None:
     values = {"setup": {"kind": "radiometric", "pixel": {"leak_rate_hz": 0.0}}}
     assert migrate("Simulation", values) == values == migrate("Something", values)
+
+
+def test_settings_of_a_kind_do_not_call_themselves_another() -> None:
+    """They could be saved, and not be read again."""
+    with pytest.raises(ConfigError):
+        PaperSetup(kind="radiometric")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ConfigError):
+        EventPixel(kind="v2e")  # pyright: ignore[reportArgumentType]
+
+
+def test_classes_of_one_name_in_two_modules_are_two() -> None:
+    registry = Registry("evnlos.none", "thing")
+    first, second = (type("Thing", (), {"kind": "one", "__module__": module}) for module in ("a", "b"))
+    registry.register(first)
+    registry.register(first)
+    with pytest.raises(ConfigError):
+        registry.register(second)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("Simulation", {"transport": "paper"}),
+        ("Lab", {"transport": ["paper"]}),
+        ("Simulation", {"rigs": 3, "setups": 5}),
+        ("Simulation", {"transport": {"kind": "paper"}, "setup": {"kind": "radiometric"}}),
+        ("Training", {"paradigm": "event", "modality": "frame"}),
+        ("Training", {"joint": True, "network": {"kind": "unet"}}),
+        ("Training", {"restandardise": "no"}),
+    ],
+)
+def test_names_of_before_that_contradict_those_of_today_are_refused(name, values) -> None:
+    with pytest.raises(ConfigError):
+        migrate(name, values)
+
+
+def test_names_of_before_that_say_the_same_pass() -> None:
+    assert migrate("Simulation", {"rigs": 3, "setups": 3}) == {"setups": 3}
+    assert migrate("Training", {"joint": True, "network": {"kind": "sequence"}})["network"] == {
+        "kind": "sequence"
+    }

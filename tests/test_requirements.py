@@ -44,7 +44,6 @@ def test_what_the_package_imports_is_declared() -> None:
         "av",
         "fontpkg",
         "matplotlib",
-        "mitsuba",
         "deepinv",
         "gradio",
         "starlette",

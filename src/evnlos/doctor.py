@@ -125,7 +125,6 @@ _EXTRAS = {
     "zstandard": ("ros", "reads packed ROS recordings"),
     "av": ("video", "reads and writes videos"),
     "matplotlib": ("plot", "draws figures"),
-    "mitsuba": ("lab", "checks the optics against a path tracer"),
     "gradio": ("app", "opens the page to play with"),
     "distributed": ("cluster", "simulates on a Dask cluster"),
 }

@@ -29,13 +29,15 @@ def psnr(image: torch.Tensor, truth: torch.Tensor, peak: float = 1.0) -> torch.T
         One value per image, shape [...]; infinite where the two are equal.
 
     Raises:
-        DataError: The shapes differ, or a value is not finite.
+        DataError: The shapes differ, a value is not finite, or the peak is not above 0.
 
     Example:
         >>> psnr(torch.zeros(8, 8), torch.full((8, 8), 0.1)).item()
         20.0
     """
     image, truth = checked(image, truth)
+    if not peak > 0:
+        raise DataError(f"peak is {peak}; give the largest possible value, above 0")
     mse = (image - truth).square().mean(dim=(-2, -1))
     return 10 * torch.log10(peak**2 / mse)
 
@@ -59,7 +61,7 @@ def ssim(
         One value per image, shape [...].
 
     Raises:
-        DataError: The shapes differ, a value is not finite, or the image is smaller than the window.
+        DataError: The shapes differ, a value is not finite, or the window is even or larger than the image.
 
     Example:
         >>> image = torch.linspace(0, 1, 256).reshape(16, 16)
@@ -68,6 +70,8 @@ def ssim(
     """
     image, truth = checked(image, truth)
     height, width = image.shape[-2:]
+    if window < 1 or window % 2 == 0:
+        raise DataError(f"ssim: window is {window}; give an odd number of pixels")
     if min(height, width) < window:
         raise DataError(
             f"ssim: image is {height} x {width}; the window of {window} needs {window} pixels per side"

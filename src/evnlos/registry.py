@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -59,7 +60,7 @@ class Registry(Generic[T]):
         if not kind:
             raise ConfigError(f"{_name(cls)} has no kind; give it a field `kind` with a default")
         there = self._classes.get(kind)
-        if there is not None and _name(there) != _name(cls):
+        if there is not None and (there.__module__, _name(there)) != (cls.__module__, _name(cls)):
             raise ConfigError(
                 f"the {self.what} {kind!r} is {_name(there)} already; give {_name(cls)} another kind"
             )
@@ -135,7 +136,7 @@ class Kinded:
     """The kind of a mapping that names none."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers outside the range of their unit (docs/units.md).
+        """Refuse numbers outside the range of their unit (docs/units.md), and another class's kind.
 
         Raises:
             ConfigError: There is one.
@@ -143,6 +144,9 @@ class Kinded:
         from evnlos.config import check_made  # which needs this module
 
         check_made(self)
+        stated, own = kind_of(self), kind_of(type(self))
+        if stated != own:
+            raise ConfigError(f"kind is {stated!r}; {_name(type(self))} holds the settings of kind {own!r}")
 
     @classmethod
     def class_for(cls, values: object) -> type:
@@ -240,11 +244,15 @@ def _training(values: dict[str, Any]) -> dict[str, Any]:
         network = values["network"] = _network(network)
     if "joint" in values:
         kind = "sequence" if values.pop("joint") else "unet"
-        values["network"] = {"kind": kind, **(network if isinstance(network, dict) else {})}
+        stated = dict(network) if isinstance(network, dict) else {}
+        _refuse_two("joint", kind == "sequence", "network.kind", stated.get("kind", kind) == "sequence")
+        values["network"] = {"kind": kind, **stated}
     if values.get("loss") == "balanced":
         values["loss"] = "normalized_bce_mse_ssim"
     if "restandardise" in values:
-        values["keep_normalization"] = not values.pop("restandardise")
+        if not isinstance(anew := values.pop("restandardise"), bool):
+            raise ConfigError(f"restandardise is {anew!r}; give keep_normalization: true or false")
+        values["keep_normalization"] = not anew
     return values
 
 
@@ -268,12 +276,16 @@ def _run(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _renamed(values: dict[str, Any], **names: str) -> dict[str, Any]:
-    """Return a copy with keys of before in today's names, in their places; names of today win."""
-    return {
-        names.get(key, key): value
-        for key, value in values.items()
-        if key not in names or names[key] not in values
-    }
+    """Return a copy with keys of before in today's names, in their places; refused if both differ."""
+    for before, now in names.items():
+        if before in values and now in values:
+            _refuse_two(before, values[before], now, values[now])
+    return {names.get(key, key): value for key, value in values.items()}
+
+
+def _refuse_two(before: str, old: object, now: str, new: object) -> None:
+    if old != new:
+        raise ConfigError(f"{before} is {old!r} and {now}, its name of today, {new!r}; leave {before} out")
 
 
 def _record(values: dict[str, Any]) -> dict[str, Any]:
@@ -284,16 +296,6 @@ def _record(values: dict[str, Any]) -> dict[str, Any]:
     for before, now in words.items():
         arm = arm.replace(before, now)
     return values | {"arm": arm} if "arm" in values else values
-
-
-def _capture(values: dict[str, Any]) -> dict[str, Any]:
-    """The `capture.yaml` of a recording."""
-    return _renamed(values, rig="setup")
-
-
-def _target(values: dict[str, Any]) -> dict[str, Any]:
-    """The target of a `capture.yaml`."""
-    return _renamed(values, plate_m="size_m")
 
 
 def _paper_setup(values: dict[str, Any]) -> dict[str, Any]:
@@ -340,8 +342,12 @@ def _one_setup(values: dict[str, Any]) -> dict[str, Any]:
     there = [key for key in ("transport", *_CAMERAS) if key in values]
     found = {key: value for key, value in values.items() if key not in there}
     if there:
-        setup = dict(values.get("setup") or values.get("transport") or {})
-        setup |= {key: values[key] for key in _CAMERAS if key in values}
+        if "transport" in values and "setup" in values:
+            _refuse_two("transport", values["transport"], "setup", values["setup"])
+        setup = values.get("setup") or values.get("transport") or {}
+        if not isinstance(setup, dict):
+            raise ConfigError(f"the setup is {setup!r}; give its settings, e.g. {{kind: paper}}")
+        setup = setup | {key: values[key] for key in _CAMERAS if key in values}
         found["setup"] = setup
     for ranges in ("vary", "spread"):
         if isinstance(found.get(ranges), dict):
@@ -381,8 +387,8 @@ _STEPS: dict[str, tuple[Step, ...]] = {
     "weights": (_weights,),
     "run": (_run,),
     "Record": (_record,),
-    "CaptureInfo": (_capture,),
-    "TargetInfo": (_target,),
+    "CaptureInfo": (partial(_renamed, rig="setup"),),
+    "TargetInfo": (partial(_renamed, plate_m="size_m"),),
     "PaperSetup": (_paper_setup,),
     **dict.fromkeys(_GLYPHS, (_glyphs,)),
     **dict.fromkeys(("UNetConfig", "SequenceConfig"), (_network,)),

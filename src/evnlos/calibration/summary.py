@@ -260,7 +260,7 @@ def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
 
 
 def calibrate(
-    captures: Iterable[str | Path],
+    captures: str | Path | Iterable[str | Path],
     out: str | Path | None = None,
     settings: Calibration | None = None,
     *,
@@ -294,7 +294,7 @@ def calibrate(
         DataError: As for `fit_setup`, and as for `write_setup`.
     """
     settings = Calibration() if settings is None else settings
-    folders = [Path(one) for one in captures]
+    folders = [Path(one) for one in ([captures] if isinstance(captures, str | Path) else captures)]
     if out is not None:
         check_out(Path(out), force)
     if any(path.is_dir() for path in folders):

@@ -238,6 +238,23 @@ class PixelSettings(Kinded):
         """
         return None
 
+    def known_law(self, light_dn: float) -> CrossingLaw:
+        """Return `crossing_law`, without which nobody knows what an event says of the light.
+
+        Args:
+            light_dn: As for `crossing_law`.
+
+        Raises:
+            ConfigError: The model states none.
+        """
+        law = self.crossing_law(light_dn)
+        if law is None:
+            raise ConfigError(
+                f"{type(self).__name__}, the setup's event model, states no law of its crossings; take one of "
+                "kind continuous, v2e, brownian or circuit, or the frames alone"
+            )
+        return law
+
     @property
     def disorder_s(self) -> float:
         """By how much an event of later light may carry an earlier time stamp, seconds."""

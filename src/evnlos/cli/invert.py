@@ -77,8 +77,8 @@ class InvertCommand:
     30; their mean is the image, and where they differ it is a guess. 0 = the Gaussian prior, none are drawn."""
     changing: tuple[float, float] | None = None
     """One capture: nothing moves as a whole; estimate a film of a hidden plane of this width and height,
-    metres, whose middle is that of the setup's target plane: an image per frame, with an error of each cell,
-    and a NAME.gif that shows them."""
+    metres, whose middle is that of the setup's target plane, with an error of each cell, and a NAME.gif that
+    shows it: an image per frame, or with --from events or both ten a second and more."""
     solver: Literal["all", "tikhonov", "tv"] = "all"
     """Smooth (`tikhonov`), sharp and not below 0 (`tv`), or both and, as a control, without the occluders."""
     regularization: str = "cv"
@@ -239,48 +239,43 @@ class InvertCommand:
         print(json.dumps(found) if self.json else table)
 
     def _film(self, word: Path, sides_m: tuple[float, float]) -> None:
-        from evnlos.cli.invert_captures import linear_setup
-        from evnlos.data import pattern_of, read_capture
-        from evnlos.data.fixed_pattern import object_light
-        from evnlos.inverse import estimate_film
+        from evnlos.cli.invert_captures import capture_of, linear_setup
+        from evnlos.data import pattern_of
+        from evnlos.models import estimate_film_of
         from evnlos.plot.results import draw_inversion
         from evnlos.report.pictures import grey, save_animation
         from evnlos.types import Plane
 
         refuse_existing(self.force, film := self.out.with_suffix(".gif"))
-        if len(self.files) != 1 or self.evidence is not None or self.positions or self.track:
-            raise ConfigError("--changing takes the frames of one capture; leave --from, --positions, --track")
+        if len(self.files) != 1 or self.samples or self.positions or self.track:
+            raise ConfigError("--changing takes one capture; leave --samples, --positions, --track")
         if not (min(sides_m) > 0 and max(sides_m) < np.inf and self.cells >= 2):
             raise ConfigError(
                 f"--changing is {sides_m[0]:g} x {sides_m[1]:g} m of {self.cells} cells; give sides above 0 "
                 "and 2 cells or more"
             )
         clock = time.perf_counter()
-        setup, capture = linear_setup(word), read_capture(self.files[0], needs_events=False)
+        evidence = self.evidence or "frames"
+        setup, capture = linear_setup(word), capture_of(self.files[0], evidence)
         pitch = max(sides_m) / self.cells
         across, down = (max(1, round(side / pitch)) for side in sides_m)
         plane = Plane(down, across, pitch)
-        height, width = capture.frames.shape[1:]
-        columns = min(self.columns, width)
-        shape = (max(1, round(height * columns / width)), columns)
-        pattern = pattern_of(word, self.pattern)
-        light = object_light(capture.frames, capture.peak, setup, shape, pattern).double()
-        level = light.mean(dim=0) + setup.ambient_light(shape)
-        averaged = height * width / (shape[0] * shape[1])  # of the sensor's pixels, each with its own noise
-        noise = (setup.frame_camera.noise_variance(level) / averaged).sqrt()
-        operator = setup.seen_by((height, width)).operator(plane, shape)
-        found = estimate_film(operator, light, capture.frame_times_us * 1e-6, noise, static=self.static)
+        pattern = None if evidence == "events" else pattern_of(word, self.pattern)
+        how = evidence, pattern, self.columns, self.static
+        with ProgressBars() as progress:
+            found = estimate_film_of(capture, setup, plane, *how, progress)
         shown = np.linspace(0, len(found.mean) - 1, min(6, len(found.mean))).round().astype(int)
         panels = [(f"{found.times_s[k]:.2f} s", torch.from_numpy(found.mean[k])[None]) for k in shown]
         result: dict[str, Any] = {
             "setup": str(word),
             "capture": capture.name,
+            "from": evidence,
             "images": len(found.mean),
             "cells": list(plane.shape),
             "prior": found.prior._asdict(),
             "noise_factor": found.noise_factor,
             "static": found.static,
-            "evidence": found.evidence,
+            "evidence": found.evidence if evidence == "frames" else None,
             "picture": drawn(self.out, lambda: draw_inversion(self.out, panels)),
             "animation": str(film),
         }
@@ -344,11 +339,13 @@ def film_text(found: dict[str, Any]) -> str:
     """Return the figures of a film as lines for people."""
     prior, (height, width) = found["prior"], found["cells"]
     lines = [
-        f"{found['capture']}: {found['images']} images of {width} x {height} cells",
+        f"{found['capture']}: {found['images']} images of {width} x {height} cells, by {found['from']}",
         f"prior of the largest likelihood: cells change by {prior['deviation']:.3g}, rest within "
         f"{prior['deviation'] * prior['resting']:.3g}, at {100 * prior['speed_m_s']:.3g} cm per second",
-        f"noise {found['noise_factor']:.2f} times the camera's, offsets {found['static']:.3g} times that",
     ]
+    if found["from"] == "frames":
+        noise = f"noise {found['noise_factor']:.2f} times the camera's"
+        lines.append(f"{noise}, offsets {found['static']:.3g} times that")
     if found["noise_factor"] > _EXPLAINED or prior["deviation"] > _BRIGHTEST:
         lines.append("warning: no plane here explains the frames; give a larger one, or check the setup")
     made = [found[name] for name in ("picture", "animation") if found.get(name)]

@@ -299,12 +299,11 @@ def estimate_captures(
     how = evidence, pattern and load_pattern(pattern), prior, samples, SequenceLights()
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
-        seen = _read_colours(folder, evidence) if colours else {None: _read(folder, evidence)}
+        seen = _read_colours(folder, evidence) if colours else {None: capture_of(folder, evidence)}
         each = [estimate_target(one, setup, *how, colour) for colour, one in seen.items()]
         parts = [_row(*pair) for pair in zip(seen.values(), each, strict=True)]
-        name = parts[0]["capture"]
         rows.append(_row_of_colours(parts) if colours else parts[0])
-        for title, part in ((name, "image"), (f"{name} deviation", "deviation")):
+        for title, part in ((name := parts[0]["capture"], "image"), (f"{name} deviation", "deviation")):
             images = [torch.from_numpy(getattr(one, part)) for one in each]
             pictures[title] = torch.stack(images) if colours else images[0]
         if (drawn := each[0].samples) is not None:
@@ -313,18 +312,19 @@ def estimate_captures(
     return {"setup": str(word), "from": evidence, "rows": rows}, pictures
 
 
-def _read(folder: Path, evidence: Evidence, colour: Colour | None = None) -> Capture:
-    frames, events = evidence != "events", evidence != "frames"
-    return read_capture(folder, needs_frames=frames, needs_events=events, colour=colour)
+def capture_of(folder: Path, evidence: Evidence, colour: Colour | None = None) -> Capture:
+    """Return a capture, refused where it lacks what the evidence is made of."""
+    needs_frames, needs_events = evidence != "events", evidence != "frames"
+    return read_capture(folder, needs_frames=needs_frames, needs_events=needs_events, colour=colour)
 
 
 def _read_colours(folder: Path, evidence: Evidence) -> dict[Colour | None, Capture]:
     """Return a capture in each colour; where events count alone its frames, which tell the time, stay grey."""
     if evidence != "events":
-        found: dict[Colour | None, Capture] = {one: _read(folder, evidence, one) for one in COLOURS}
+        found: dict[Colour | None, Capture] = {one: capture_of(folder, evidence, one) for one in COLOURS}
         _check_coloured(folder.name, [one.frames for one in found.values()])
         return found
-    grey = _read(folder, evidence)
+    grey = capture_of(folder, evidence)
     return {one: replace(grey, target=read_target(folder, grey.info.target, one)) for one in COLOURS}
 
 

@@ -258,7 +258,7 @@ def _answer_at_once(verb: str, rest: list[str]) -> Any:
         UnknownNameError: A name stands for nothing.
         SystemExit: Help was asked for, and printed.
     """
-    if verb == "doctor" or set(WORK_LIBRARIES) & set(sys.modules):
+    if verb == "doctor" or set(WORK_LIBRARIES) & set(sys.modules) or threading.active_count() > 1:
         return None
     refusal = light = None
     try:

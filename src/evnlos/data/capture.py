@@ -299,7 +299,7 @@ def _samples_of(capture: Capture, sampling: Sampling, pattern: FixedPattern | No
 
 
 def import_captures(
-    folders: Iterable[str | Path],
+    folders: str | Path | Iterable[str | Path],
     out: str | Path,
     sampling: Sampling = Sampling(),
     *,
@@ -336,6 +336,7 @@ def import_captures(
         ConfigError: The surface is solved through a setup, and none is named.
         DataError: No folder, two captures of one name, or a held-out name that no capture has.
     """
+    folders = [folders] if isinstance(folders, (str, Path)) else folders
     paths = by_name([Path(folder).resolve() for folder in folders])
     split = split_of(list(paths), list(test), list(validation))
     if sampling.is_solved:

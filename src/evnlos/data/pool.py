@@ -22,8 +22,6 @@ from multiprocessing.connection import wait as wait_for
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
-from threadpoolctl import ThreadpoolController
-
 from evnlos.errors import ConfigError, EvnlosError, MissingDependencyError
 from evnlos.machine import children_undisturbed, cores, one_thread
 
@@ -258,6 +256,8 @@ def _end_with(parent: int) -> None:
 
 def _run_here(function: Callable[[Task], Result], tasks: list[Task]) -> Iterator[Result]:
     """Run tasks one by one in this process, with one thread of NumPy's linear algebra for small products."""
+    from threadpoolctl import ThreadpoolController  # which changes the process's environment
+
     libraries = ThreadpoolController()
     for task in tasks:
         with libraries.limit(limits=1, user_api="blas"):

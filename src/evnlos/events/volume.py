@@ -329,15 +329,15 @@ def voxel_grid(
         float32 [bins, H, W].
 
     Raises:
-        DataError: Fewer than one bin, or an end before the start.
+        DataError: Not a whole number of bins, fewer than one, or an end before the start.
 
     Example:
         >>> events = Events([0, 25, 100], [0, 1, 0], [0, 0, 0], [True, False, True], width=2, height=1)
         >>> voxel_grid(events, 2).tolist()
         [[[1.0, -0.75]], [[1.0, -0.25]]]
     """
-    if bins < 1:
-        raise DataError(f"bins is {bins}; give at least 1")
+    if not isinstance(bins, int | np.integer) or bins < 1:
+        raise DataError(f"bins is {bins}; give a whole number, at least 1")
     out = np.zeros((bins, events.height, events.width), np.float32)
     if not len(events):
         return out

@@ -12,6 +12,8 @@ from .corner import Prior as Prior
 from .corner import estimate_corner as estimate_corner
 from .corner import noise_of as noise_of
 from .corner import read_penumbra as read_penumbra
+from .event_film import FilmFrames as FilmFrames
+from .event_film import estimate_event_film as estimate_event_film
 from .event_images import EVENT_ERRORS as EVENT_ERRORS
 from .event_images import EVENT_ERRORS_FILE as EVENT_ERRORS_FILE
 from .event_images import AboutErrors as AboutErrors
@@ -48,6 +50,7 @@ from .prior import root_of as root_of
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
 from .problem import SeveralSequences as SeveralSequences
+from .problem import as_physics as as_physics
 from .problem import block_folds as block_folds
 from .sequence_light import FrameTerm as FrameTerm
 from .sequence_light import NormalEquations as NormalEquations

@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 
 _KEPT = 1e-13  # of the largest squared gain; what lies below is rounding
 _LENGTHS = (1 / 16, 1 / 4, 1)  # of correlation that are tried, over the plane's longer side
-_LEAST_FRAMES = 3
+LEAST_FRAMES = 3
 _LEAST_FREE = 30  # pixels more than modes, to tell what no plane explains
 
 
@@ -66,7 +66,7 @@ class FilmEstimate:
         mean: Most probable brightness of each cell, [T, h, w]; it may be negative where nothing is known.
         deviation: Its standard deviation, [T, h, w].
         prior: The prior of the largest marginal likelihood, or the one that was given.
-        evidence: Natural logarithm of the marginal likelihood over that of an empty plane.
+        evidence: Natural logarithm of the marginal likelihood over that of an empty plane; NaN with events.
         noise_factor: Standard deviation of the frames' noise over the one that was stated, by what no plane
             explains; 1 where there are too few pixels to tell.
         static: Standard deviation of a pixel's constant offset over that of its noise, given or found.
@@ -144,6 +144,33 @@ def smooth_modes(z: Array, gain: Array, keep: Array, resting: float, static: flo
     return ModeSeries(c + (share - h) * m, variance, log_likelihood)
 
 
+def film_modes(gram: Array, plane: Plane, length_m: float) -> tuple[Array, Array]:
+    """Return squared gains of the modes of a plane, ascending, and cells of each mode, [C] and [C, C].
+
+    Args:
+        gram: A^T W^2 A of the cells, [C, C].
+        plane: The plane.
+        length_m: Length of correlation, metres.
+    """
+    smooth = normal_matrix(Gradient("dark"), torch.zeros(plane.shape, dtype=torch.float64)).numpy()
+    covariance = np.linalg.inv(smooth + (plane.pitch_m / length_m) ** 2 * np.eye(len(smooth)))
+    root = np.linalg.cholesky(covariance / covariance.diagonal().mean())
+    values, vectors = np.linalg.eigh(root.T @ gram @ root)
+    return values, root @ vectors
+
+
+def wave_numbers(basis: Array, plane: Plane) -> Array:
+    """Return the root mean square wave number of each mode, rad/m, [K].
+
+    Args:
+        basis: Cells of each mode, [C, K].
+        plane: Their plane.
+    """
+    images = torch.from_numpy(basis.T.copy()).unflatten(1, plane.shape)
+    slope = Gradient("dark")(images).square().sum(dim=(1, 2, 3)) / images.square().sum(dim=(1, 2))
+    return slope.sqrt().numpy() / plane.pitch_m
+
+
 class _Film:
     """The frames in the modes of a plane's covariance of one length."""
 
@@ -158,12 +185,8 @@ class _Film:
         length_m: float,
         static: float | None,
     ) -> None:
-        smooth = normal_matrix(Gradient("dark"), torch.zeros(plane.shape, dtype=torch.float64)).numpy()
-        covariance = np.linalg.inv(smooth + (plane.pitch_m / length_m) ** 2 * np.eye(len(smooth)))
-        root = np.linalg.cholesky(covariance / covariance.diagonal().mean())
-        values, vectors = np.linalg.eigh(root.T @ gram @ root)
+        values, self.basis = film_modes(gram, plane, length_m)
         kept = values > _KEPT * values[-1]
-        self.basis = root @ vectors  # [C, C]: from modes to cells
         gain = np.sqrt(np.where(kept, values, 0.0))
         z = (seen @ self.basis) / np.where(kept, gain, np.inf)  # [T, C]
         steps = len(z)
@@ -176,9 +199,7 @@ class _Film:
         free = samples - int(kept.sum())
         found = math.sqrt(max(outside / free - 1 / steps, 0.0)) if free >= _LEAST_FREE else 1.0
         self.static = found if static is None else static
-        images = torch.from_numpy(self.basis.T.copy()).unflatten(1, plane.shape)
-        slope = Gradient("dark")(images).square().sum(dim=(1, 2, 3)) / images.square().sum(dim=(1, 2))
-        self.wave_number = slope.sqrt().numpy() / plane.pitch_m
+        self.wave_number = wave_numbers(self.basis, plane)
 
     def smoothed(self, prior: FilmPrior, dt_s: Array) -> ModeSeries:
         keep = np.exp(-dt_s[:, None] * prior.speed_m_s * self.wave_number)
@@ -225,7 +246,7 @@ def estimate_film(
         (True, (5, 2, 2))
     """
     times = np.asarray(times_s, np.float64)
-    _check(operator, frames, times, noise_std, static, prior)
+    check_film(operator, frames, times, noise_std, static, prior)
     plane = operator.source
     assert isinstance(plane, Plane)  # checked above
     weight = 1 / noise_std.double().flatten()
@@ -284,7 +305,7 @@ def _likeliest(film: _Film, dt_s: Array) -> FilmPrior:
     return prior_at(found.x)
 
 
-def _check(
+def check_film(
     operator: LinearTransport,
     frames: torch.Tensor,
     times: Array,
@@ -292,6 +313,16 @@ def _check(
     static: float | None,
     prior: FilmPrior | None,
 ) -> None:
+    """Refuse what cannot be a film: the arguments of `estimate_film`, its errors.
+
+    Args:
+        operator: A.
+        frames: [T, H, W].
+        times: [T], seconds.
+        noise_std: [H, W].
+        static: None is to be found.
+        prior: None is to be found.
+    """
     if not isinstance(operator.source, Plane):
         raise ConfigError("the operator starts from patches; give one from a Plane of square cells")
     if static is not None and not (math.isfinite(static) and static >= 0):
@@ -301,9 +332,9 @@ def _check(
     shape = operator.shape
     if frames.ndim != 3 or tuple(frames.shape[1:]) != shape or not frames.is_floating_point():
         raise DataError(f"the frames are {frames.dtype} {tuple(frames.shape)}; give real [T, {shape}]")
-    if len(frames) < _LEAST_FRAMES or times.shape != (len(frames),) or not (np.diff(times) > 0).all():
+    if len(frames) < LEAST_FRAMES or times.shape != (len(frames),) or not (np.diff(times) > 0).all():
         raise DataError(
-            f"{len(frames)} frames at times {times.shape}; give {_LEAST_FRAMES} or more, at increasing times"
+            f"{len(frames)} frames at times {times.shape}; give {LEAST_FRAMES} or more, at increasing times"
         )
     if tuple(noise_std.shape) != shape or not bool((torch.isfinite(noise_std) & (noise_std > 0)).all()):
         raise DataError(f"noise_std is {tuple(noise_std.shape)}; give {shape} finite numbers above 0")

@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse.prior import PatternPrior, ScoreErrors, handwritten_prior, root_of
@@ -231,6 +230,8 @@ def event_statistic(
     Arguments and errors as of `event_images`; `side_m` is the side of the target plane, metres.
     """
     found = _sequence(events, edges_us, motion, setup, side_m)
+    from threadpoolctl import threadpool_limits  # whose import changes the environment
+
     with threadpool_limits(1):  # its products are small: a second thread mostly waits
         return found.solver(found.events), found.prior
 
@@ -306,6 +307,8 @@ def event_images(
     side_m, places = seen.prior.target_plane.extent_m[0], seen.position_m
     steps = _worth_solving(seen) if so_far else [0]
     until = seen.instants_s[steps] if so_far else seen.solver.light.times_s[-1:]
+    from threadpoolctl import threadpool_limits  # whose import changes the environment
+
     with threadpool_limits(1):
         found = seen.solver.so_far(seen.events, until)
         images = np.empty((len(places), len(EVENT_PRIORS), canvas.height, canvas.width), np.float32)
@@ -355,10 +358,4 @@ def _solver(
     prior = event_prior(known, side_m)
     note("light path of the events")
     light = sequence_light(known.seen_by(shape), prior, motion.position_m, span_s, shape)
-    law = known.pixel.crossing_law(light.typical_dn)
-    if law is None:
-        raise ConfigError(
-            f"{setup}: its event model states no law of its crossings; give one of kind continuous, v2e, "
-            "brownian or circuit"
-        )
-    return EventSolver(light, law), prior
+    return EventSolver(light, known.pixel.known_law(light.typical_dn)), prior

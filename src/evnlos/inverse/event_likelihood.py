@@ -199,32 +199,15 @@ def _add_events(
 ) -> float:
     """Add the rows of crossings and silences, update `trust`, and return the error of a crossing."""
     count = len(unknown) - _NUISANCES
-    seen = light(unknown[:count])
-    levels = levels_of(seen, light.times_s, law)
-    state = _State(light, law, record, unknown[count:], least, seen, levels)
-    state.update_trust(trust)
-    scatter = state.scatter(trust)
-    noise = max(least, scatter)
-    state = _State(light, law, record, unknown[count:], noise, seen, levels)
-    state.update_trust(trust)
-    temper = state.temper(trust, max(scatter, _SMALLEST_NOISE))
-    quiet = [state.silences(sign, trust) for sign in (1, -1)]
-    steep = state.steepness(trust)
+    found = rows_of(light, law, record, unknown[:count], least, trust, unknown[count:])
+    together, steep, wait = found.changes, found.times, found.wait
     needed = record.measured.copy()
-    for one in quiet:
-        needed[one.at] = True
+    needed[together.at] = True
     part, kept = record.only(needed), np.flatnonzero(needed)
     place = np.full(len(part), -1)  # in the whole record; references alone have none
     place[part.origin >= 0] = kept
-    crossed = np.flatnonzero(record.measured)
-    crossings = Rows(
-        crossed, record.sign[crossed], trust[crossed] / state.variance[crossed], state.residual[crossed]
-    )
-    columns = [np.concatenate(column) for column in zip(crossings, *quiet, strict=True)]
-    order = np.lexsort((columns[1], record.pixel[columns[0]]))  # by pixel, then by polarity
-    together = Rows(*(column[order] for column in columns))
     owner = record.pixel[together.at]
-    for block, rows, rates in part.blocks(light, levels, most):
+    for block, rows, rates in part.blocks(light, found.levels, most):
         mine = place[block]
         pixels = part.pixel[block]
         here = slice(np.searchsorted(owner, pixels[0]), np.searchsorted(owner, pixels[-1], side="right"))
@@ -235,15 +218,15 @@ def _add_events(
         extra = np.zeros((len(at), _NUISANCES))
         extra[:, 0] = np.where(sign > 0, -law.threshold_on, 0.0)
         extra[:, 1] = np.where(sign < 0, law.threshold_off, 0.0)
-        extra[:, 2] = state.wait[at]
+        extra[:, 2] = wait[at]
         whole = np.concatenate([rows[row], extra], axis=1)
         total.add(whole, together.weight[here], together.residual[here], group, law.threshold_sigma)
         events = np.flatnonzero((mine >= 0) & record.measured[np.maximum(mine, 0)])
         at = mine[events]
         sloping = np.zeros((len(at), len(unknown)))
         sloping[:, :count], sloping[:, -1] = rates[events], 1.0
-        total.add(sloping, temper[at] * steep.weight[at], steep.residual[at], at, 0.0)
-    return float(noise)
+        total.add(sloping, steep.weight[at], steep.residual[at], at, 0.0)
+    return found.noise
 
 
 class Rows(NamedTuple):
@@ -255,7 +238,63 @@ class Rows(NamedTuple):
     residual: Array
 
 
-class _State:
+class EventRows(NamedTuple):
+    """All that the events of a sequence say about one estimate of its light."""
+
+    changes: Rows
+    """Of crossings and silences: changes since the origin of an instant, by pixel, then by polarity."""
+    times: Rows
+    """Of the density in time: rates of change at each instant of the record."""
+    levels: Levels
+    """Those of the estimate."""
+    wait: Array
+    """Time of each instant since its origin, seconds."""
+    noise: float
+    """Error of a crossing, log units."""
+
+
+def rows_of(
+    light: SequenceLight,
+    law: CrossingLaw,
+    record: EventRecord,
+    z: Array,
+    least: float,
+    trust: Array,
+    nuisances: Array | None = None,
+) -> EventRows:
+    """Return the rows of crossings, silences and times about an estimate, and bring `trust` up to date.
+
+    Args:
+        light: The light.
+        law: Constants of the event model.
+        record: The events, with silences.
+        z: The estimate, as `light` takes it.
+        least: Least error of a crossing, log units.
+        trust: Probability of each instant to be a signal, [N]; changed in place.
+        nuisances: Relative errors of the thresholds ON and OFF, and of the leak; None = none.
+    """
+    unknown = np.zeros(_NUISANCES) if nuisances is None else nuisances
+    seen = light(z)
+    levels = levels_of(seen, light.times_s, law)
+    state = EventState(light, law, record, unknown, least, seen, levels)
+    state.update_trust(trust)
+    scatter = state.scatter(trust)
+    noise = max(least, scatter)
+    state = EventState(light, law, record, unknown, noise, seen, levels)
+    state.update_trust(trust)
+    steep = state.steepness(trust)
+    steep = steep._replace(weight=steep.weight * state.temper(trust, max(scatter, _SMALLEST_NOISE)))
+    crossed = np.flatnonzero(record.measured)
+    crossings = Rows(
+        crossed, record.sign[crossed], trust[crossed] / state.variance[crossed], state.residual[crossed]
+    )
+    quiet = (state.silences(sign, trust) for sign in (1, -1))
+    columns = [np.concatenate(column) for column in zip(crossings, *quiet, strict=True)]
+    order = np.lexsort((columns[1], record.pixel[columns[0]]))
+    return EventRows(Rows(*(column[order] for column in columns)), steep, levels, state.wait, float(noise))
+
+
+class EventState:
     """What a record says at one estimate: changes, residuals, slopes, and the offsets of the thresholds."""
 
     def __init__(

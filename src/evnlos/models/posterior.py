@@ -36,21 +36,26 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.data import Capture, FixedPattern
-from evnlos.data.fixed_pattern import own_pixels
+from evnlos.data.fixed_pattern import object_light, own_pixels
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.inverse import (
+    FilmEstimate,
+    FilmFrames,
     FrameTerm,
     LikelihoodSettings,
     PatternPrior,
     SequenceEstimate,
     SequenceLight,
     SequenceLights,
+    estimate_event_film,
+    estimate_film,
     estimate_sequence,
     record_of,
 )
 from evnlos.inverse.event_images import COEFFICIENTS, event_prior
-from evnlos.machine import note
+from evnlos.machine import Progress, note, silent
 from evnlos.models.unet import ResidualUNet, UNetConfig
 from evnlos.models.weights import weights_folders
 from evnlos.setups import Setup
@@ -357,12 +362,7 @@ def estimate_target(
         frames = FrameTerm(shown, values, times, setup.frame_camera, pattern is not None, setup.frame_doubt)
     if evidence != "frames":
         light, own = behind("events")
-        law = setup.pixel.crossing_law(light.typical_dn)
-        if law is None:
-            raise ConfigError(
-                f"{capture.name}: the setup's event model states no law of its crossings; give one of kind "
-                "continuous, v2e, brownian or circuit, or --from frames"
-            )
+        law = setup.pixel.known_law(light.typical_dn)
         record = record_of(capture.events, law, span, _GAP_S)
         if colour is not None:
             kept = own[record.pixel]
@@ -379,3 +379,63 @@ def estimate_target(
         low, high = interval_of(each)
     seconds = round(time.process_time() - begun, 1)
     return TargetEstimate(basis.target_plane, image, deviation, low, high, error, seconds, found, drawn)
+
+
+_FILM_STEP_S = 0.1  # between images of a film that events tell
+
+
+def estimate_film_of(
+    capture: Capture,
+    setup: Setup,
+    plane: Plane,
+    evidence: Literal["frames", "events", "both"] = "frames",
+    pattern: FixedPattern | None = None,
+    columns: int = 64,
+    static: float | None = None,
+    progress: Progress = silent,
+) -> FilmEstimate:
+    """Return the film of a hidden plane that changes, from a capture of it.
+
+    Args:
+        capture: The recording; its motion does not matter.
+        setup: Its setup, linear.
+        plane: The hidden plane, about the middle of the setup's.
+        evidence: Of frames, an image each; of events, and of both, one every tenth of a second, or as many as
+            frames where these are more frequent.
+        pattern: Fixed pattern of the frame camera, to be taken off.
+        columns: Columns to which frames are reduced, pixels.
+        static: Standard deviation of a pixel's constant offset over that of its noise; None: as the frames say.
+        progress: Told the iterations.
+
+    Raises:
+        ConfigError: The event model states no law of its crossings.
+        DataError: Too few frames, or too many images.
+    """
+    times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
+    frames, found = None, None
+    if evidence != "events":
+        height, width = capture.frames.shape[1:]
+        across = min(columns, width)
+        shape = (max(1, round(height * across / width)), across)
+        light = object_light(capture.frames, capture.peak, setup, shape, pattern).double()
+        level = light.mean(dim=0) + setup.ambient_light(shape)
+        averaged = height * width / (shape[0] * shape[1])  # of the sensor's pixels, each with its own noise
+        noise = (setup.frame_camera.noise_variance(level) / averaged).sqrt()
+        operator = setup.seen_by((height, width)).operator(plane, shape)
+        found = estimate_film(operator, light, times, noise, static=static)
+        if evidence == "frames":
+            return found
+        frames = FilmFrames(operator, light, times, noise * found.noise_factor, found.static)
+    size = (capture.events.height, capture.events.width)
+    seen, span = setup.seen_by(size), (float(times[0]), float(times[-1]))
+    still = seen.ambient_light(size)
+    law = setup.pixel.known_law(WHITE_DN * float(still.mean()))
+    record = record_of(capture.events, law, span, _GAP_S)
+    count = max(len(times), round((span[1] - span[0]) / _FILM_STEP_S) + 1)
+    nodes, prior = np.linspace(*span, count), None if found is None else found.prior
+    from threadpoolctl import threadpool_limits  # whose import changes the environment
+
+    with threadpool_limits(1):
+        return estimate_event_film(
+            seen.operator(plane, size), still, record, law, nodes, frames=frames, prior=prior, progress=progress
+        )

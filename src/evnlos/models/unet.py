@@ -50,8 +50,7 @@ class UNetConfig(ReconstructorSettings):
     group of channels."""
 
     def __post_init__(self) -> None:
-        if self.kind != type(self).kind:
-            raise ConfigError(f"kind is {self.kind!r}; these are the settings of kind {type(self).kind!r}")
+        super().__post_init__()
         for name in ("width", "depth", "blocks", "shuffle", "groups"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"UNetConfig.{name} is {getattr(self, name)}; give at least 1")
@@ -65,7 +64,6 @@ class UNetConfig(ReconstructorSettings):
             )
         if self.width % self.groups:
             raise ConfigError(f"UNetConfig.groups is {self.groups}; give a divisor of the width {self.width}")
-        super().__post_init__()
 
     @property
     def least_tensors(self) -> int:

@@ -131,8 +131,8 @@ def tpsf_kernel(
     check_lengths(pitch_m=pitch_m)
     if points < 2:
         raise ConfigError(f"points is {points}; the profile needs 2 or more")
-    if not kernel_radius > 0:
-        raise ConfigError(f"kernel_radius is {kernel_radius}; give a radius above 0")
+    if not 0 < kernel_radius < math.inf:
+        raise ConfigError(f"kernel_radius is {kernel_radius}; give a finite radius above 0")
     if not 0 <= window <= 1:
         raise ConfigError(f"window is {window}; give a fraction of the radius, 0 to 1")
     step = kernel_radius / (points - 1)  # rho a sample

@@ -21,12 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from evnlos.cameras import CrossingLaw
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data.sampling import reduce_by_area
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import DataError
 from evnlos.events import event_histogram
 from evnlos.inverse import (
     EventRecord,
@@ -225,14 +224,16 @@ def fit_motion_to_events(
     columns = min(columns, shape[1])
     coarse = (max(1, round(shape[0] * columns / shape[1])), columns)
     ambient = seen.ambient_light(shape)
-    law = _law(seen, WHITE_DN * float(ambient.mean()))
+    law = seen.pixel.known_law(WHITE_DN * float(ambient.mean()))
     counts = event_counts(events, times, coarse)
     start_m = _first_path(counts, ambient.numpy(), seen, law, times, size_m, coarse)
     fit = EventFit(
         seen, strip_corners(start_m, size_m, turning), times, shape, coarse, size_m, cells, depth, turning
     )
-    law = _law(seen, fit.light(start := fit.start(start_m)).typical_dn)
+    law = seen.pixel.known_law(fit.light(start := fit.start(start_m)).typical_dn)
     record = record_of(events, law, span_s, fit.settings.gap_s)
+    from threadpoolctl import threadpool_limits  # whose import changes the environment
+
     with threadpool_limits(1):  # products are small: a second thread mostly waits
         path, covariance = fit.solved(start, record, law, events.width)
     share, chance = fit.explained(path, covariance, counts, law, coarse)
@@ -242,16 +243,6 @@ def fit_motion_to_events(
             f"explain {100 * chance:.2g} %: nothing to follow; light the target more, or lower the thresholds"
         )
     return times, fit.as_motion(path, covariance)
-
-
-def _law(setup: Setup, typical_dn: float) -> CrossingLaw:
-    law = setup.pixel.crossing_law(typical_dn)
-    if law is None:
-        raise ConfigError(
-            "the setup's event model states no law of its crossings; give one of kind continuous, v2e, "
-            "brownian or circuit, or follow the frames"
-        )
-    return law
 
 
 def _said(counts: Array, law: CrossingLaw) -> Array:
