@@ -187,14 +187,14 @@ def compare_events(name: str, seed: int, roughness: float) -> list[str]:
 
     few = estimate_film(operator, light[FEW], times[FEW], noise)
     between = [np.interp(times, times[FEW], cell) for cell in few.mean.reshape(len(few.mean), -1).T]
-    beside = FilmFrames(operator, light[FEW], times[FEW], noise * few.noise_factor, few.static)
+    beside = FilmFrames(operator, light[FEW], noise, few)
     seen = operator, still, record, law, times
     return [
         f"{len(events) / still.numel():.1f}",
         told(estimate_film(operator, light, times, noise)),
         told(estimate_event_film(*seen)),
         f"{decibel(torch.from_numpy(np.stack(between, axis=1)).reshape(truth.shape), truth):.2f}",
-        told(estimate_event_film(*seen, frames=beside, prior=few.prior)),
+        told(estimate_event_film(*seen, frames=beside)),
     ]
 
 

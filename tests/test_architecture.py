@@ -122,6 +122,7 @@ def test_the_core_imports_nothing_heavy(path: Path) -> None:
 
 
 WHOLE_CHAPTERS = {
+    "analysis/confidence.py",
     "app/views.py",
     "calibration/scan/film.py",
     "cameras/pixels/brownian.py",

@@ -210,7 +210,7 @@ def test_sums_over_the_nodes_are_those_of_whole_rows(spread: float) -> None:
     """Slow reference: each row as a vector over all nodes and modes."""
     rng = np.random.default_rng(5)
     pixels, nodes, modes, count = 300, 6, 3, 900
-    light = FilmLight.of(draw(pixels, modes), np.ones(pixels), np.arange(nodes) / 10, (20, 15))
+    light = FilmLight.of(draw(pixels, modes), np.ones((pixels, 1)), np.arange(nodes) / 10, (20, 15))
     pixel, group = np.sort(rng.integers(0, pixels, count)), rng.integers(-1, 2, count)
     group = np.where(group < 0, -1, 2 * pixel + group)
     pixel, group = (column[np.lexsort((group, pixel))] for column in (pixel, group))
@@ -248,11 +248,11 @@ def test_events_tell_a_film_and_frames_beside_them_more() -> None:
     camera = FrameCamera(prnu=0, dsnu_e=0)
     seen = torch.from_numpy(camera.capture(wall, times, 1) / camera.white) - still
     noise = camera.noise_variance(seen.mean(dim=0) + still).sqrt()
-    frames = FilmFrames(operator, seen[::3], times[::3], noise, 0.0)
     alone = estimate_film(operator, seen[::3], times[::3], noise)
+    frames = FilmFrames(operator, seen[::3], noise, alone)
     each = {
         "events": estimate_event_film(operator, still, record, law, times),
-        "both": estimate_event_film(operator, still, record, law, times, frames=frames, prior=alone.prior),
+        "both": estimate_event_film(operator, still, record, law, times, frames=frames),
     }
     error = {name: float(np.square(one.mean - images).mean()) for name, one in each.items()}
     between = np.stack([np.interp(times, times[::3], one) for one in alone.mean.reshape(11, -1).T], axis=1)

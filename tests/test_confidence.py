@@ -12,12 +12,21 @@ import pytest
 import torch
 
 from evnlos.analysis import evaluate, identify, load_model, reconstruct
-from evnlos.analysis.confidence import confidence_of, explained, light_gain, risk_coverage
-from evnlos.analysis.identify import QUICK, verdict_on
+from evnlos.analysis.confidence import (
+    EventChanges,
+    confidence_of,
+    explained,
+    light_gain,
+    risk_coverage,
+    share_held,
+)
+from evnlos.analysis.identify import GUESSED, QUICK, verdict_on
 from evnlos.app.views import verdict_box
+from evnlos.cameras import EventPixel
 from evnlos.cli import main
 from evnlos.config import load_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
+from evnlos.data.lab import published_lab, render_captures
 from evnlos.errors import DataError, MissingDependencyError
 from evnlos.machine import Step
 from evnlos.metrics import psnr
@@ -37,7 +46,7 @@ from evnlos.models.confidence import COVERAGE, fit_confidence, on_canvas
 from evnlos.report import reconstruct_capture
 from evnlos.report.sections import limits_section
 from evnlos.setups import RadiometricSetup, load_setup
-from evnlos.types import Plane
+from evnlos.types import Events, Plane
 
 CANVAS = Plane(48, 96, 0.0025)
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
@@ -353,14 +362,15 @@ def test_all_say_the_same_of_a_setup_and_of_a_recording(default_capture, tmp_pat
     setup = model.known_setup()
     limits = identify(setup, QUICK)
     report = model.reconstruct(default_capture).confidence
-    assert found["verdict"] == asdict(verdict_on(setup, report))
-    assert found["verdict"]["wall"] == limits.wall and found["verdict"]["recording"] == report.verdict
+    assert found["verdict"] == asdict(verdict_on(setup, report, frames=found["positions"], is_stated=False))
+    meaning = limits.wall.partition(", ")[2]
+    assert "of the wall that these weights know" in found["verdict"]["wall"]
+    assert meaning in found["verdict"]["wall"] and found["verdict"]["recording"] == report.verdict
     assert found["confidence"]["verdict"] == report.verdict
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["verdict"] == found["verdict"]
     assert found["one_picture"] and found["positions"] > 1  # one image, one file of it
     assert len(list((tmp_path / "out").glob("position_*.png"))) == 1
     assert [one for one in found["verdict"].values() if one not in found["in_words"]] == []
-    meaning = limits.wall.partition(", ")[2]
     page = unescape(verdict_box(limits))
     assert meaning in page and meaning in unescape(limits_section(limits)) and meaning in limits.verdict
     main(["identify", str(published_setup("near-frame-sequence")), "--quiet"])
@@ -377,10 +387,13 @@ def test_images_so_far_are_many_and_leave_the_model_as_it_was(default_capture, t
     assert len(list((tmp_path / "out").glob("position_*.png"))) == len(images) == found["positions"]
     scores = psnr(torch.from_numpy(images), torch.from_numpy(whole.samples.truth))
     assert scores[-5:].mean() > scores[:5].mean() + 1
-    events = load_model("near-event-sequence")
-    late = events.reconstruct(default_capture, so_far=True)
+    events, lab = load_model("near-event-sequence"), published_lab("near")  # of the light that they know
+    (capture,) = render_captures(
+        lab, tmp_path / "lab", [name for name in lab.glyphs.objects() if name.endswith("_R")]
+    )
+    late = events.reconstruct(capture, so_far=True)
     assert late.confidence is None and events.weights.sampling.surface == "likelihood"
-    images = events.reconstruct(default_capture).images
+    images = events.reconstruct(capture).images
     assert (
         torch.square(late.images[-1] - images[-1]).mean()
         < 0.1 * torch.square(late.images[0] - images[0]).mean()
@@ -408,6 +421,7 @@ def test_each_verdict_says_what_is_guessed() -> None:
     nothing, sure = (ConfidenceReport(a, 0.1, torch.zeros(1), torch.ones(1), 0.9) for a in (0.0, 0.8))
     assert verdict_on(None, nothing).guessed == "the whole image is the network's guess"
     assert "intervals" in verdict_on(None, sure).guessed
+    assert verdict_on(None, replace(sure, explained=None)).guessed == GUESSED[None]
     assert verdict_on(None, None, "no confidence: why").lines[0] == "no confidence: why"
     wrong = replace(sure, explained=0.3)
     assert "70 % are required" in wrong.verdict and "distance and wall" in wrong.verdict
@@ -435,3 +449,36 @@ def test_a_verdict_without_fonts_says_what_to_install(monkeypatch) -> None:
     said = verdict_on(load_setup("main-near"), None, "too few frames")
     assert said.wall.startswith("what the wall allows is not known: no font family; pip install evnlos[fonts]")
     assert said.recording == "too few frames"
+
+
+def test_events_hold_what_true_images_show_and_not_what_others_do() -> None:
+    """Changes of the log light of a true target, in steps of thresholds, with noise events as many."""
+    path = published_setup("near-event-sequence")
+    assert path is not None
+    setup, weights = load_yaml(Simulation, path).setup, load_weights("near-event-sequence")
+    canvas, operator = weights.sampling.canvas, FrameOperator(setup, weights.sampling)
+    rng, average = np.random.default_rng(0), weights.confidence.mean
+    at = np.stack([np.linspace(-0.06, 0.06, 30), np.zeros(30)], axis=1)
+    true, other = (torch.zeros(32, 32) for _ in range(2))
+    true[4:28, 6:12], true[10:16, 6:26], other[4:28, 20:26], other[22:28, 6:26] = 1.0, 1.0, 1.0, 1.0
+    law = setup.pixel.crossing_law()
+    assert law is not None
+    blank = EventChanges(torch.zeros(29, *operator.size), law)
+    change = blank.made(operator(on_canvas(true, canvas, at)))
+    noise = 2 * float(change.std()) * torch.from_numpy(rng.standard_normal(change.shape))
+    seen = replace(blank, change=0.8 * change + noise)  # thresholds are a fifth off
+    shares = [
+        share_held(on_canvas(one, canvas, at), seen, at, average, operator, canvas)
+        for one in (true, other, average)
+    ]
+    assert shares[0] == pytest.approx(1, abs=0.1) and shares[1] < 0.3
+    found = ConfidenceReport(0.9, 0.05, true, true, shares[1], "events")
+    assert not found.measured and "the events hold" in found.verdict
+
+
+def test_changes_are_those_of_the_events_between_the_positions() -> None:
+    pixel = EventPixel(threshold_on=0.2, threshold_off=0.3)
+    events = Events([10, 20, 120], [0, 1, 3], [0, 0, 1], [True, False, True], width=4, height=2)
+    found = EventChanges.of(events, np.array([0, 100, 200]), pixel, (1, 2))
+    assert found is not None
+    assert found.change.numpy() == pytest.approx(np.array([[[(0.2 - 0.3) / 4, 0]], [[0, 0.2 / 4]]]))

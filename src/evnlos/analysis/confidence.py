@@ -1,7 +1,8 @@
 """Whether images agree with what the frames show, and whether their confidence can be trusted.
 
 - Test-time data consistency: move a network's image to where the calibrated wall agrees with the frame.
-- How much of what the frames show the images explain: the light path run forward again.
+- How much of what the frames show the images explain: the light path run forward again; of what the images
+  show, how much the events hold.
 - Whether a setup fits the light and the events of a capture whose target is solved for.
 - Is the confidence right? Support against skill, and coverage of the intervals, sequence by sequence.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,8 +19,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from evnlos.cameras import CrossingLaw, PixelSettings
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.data import NlosDataset, Samples
+from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
+from evnlos.events import event_histogram
 from evnlos.models import (
     Confidence,
     ConfidenceReport,
@@ -29,7 +35,7 @@ from evnlos.models import (
     on_target_plane,
 )
 from evnlos.models.confidence import on_canvas
-from evnlos.types import Plane
+from evnlos.types import Events, Plane
 
 _TOLERANCE, _MOST_STEPS = 1e-3, 200
 
@@ -142,6 +148,77 @@ def share_explained(
     return explained(shown, frames, position_m, average, operator, canvas)
 
 
+@dataclass(frozen=True, eq=False)
+class EventChanges:
+    """By how much the log light changed from position to position, as the events of a sequence say.
+
+    Args:
+        change: Thresholds that were crossed, log units, mean of each sample's pixels, float64 [N - 1, h, w].
+        law: Constants of the event model.
+    """
+
+    change: Tensor
+    law: CrossingLaw
+
+    @classmethod
+    def of(
+        cls, events: Events, times_us: NDArray[np.int64], pixel: PixelSettings, size: tuple[int, int]
+    ) -> EventChanges | None:
+        """Return the changes between positions; None for pixels whose model states no thresholds.
+
+        Args:
+            events: The events.
+            times_us: Times of the positions, [N], microseconds.
+            pixel: The setup's event model.
+            size: Size (h, w) of the samples.
+        """
+        if (law := pixel.crossing_law()) is None:
+            return None
+        changes = []
+        for start, stop in pairwise(times_us.tolist()):
+            on, off = event_histogram(events, [start, stop])[0]
+            changes.append(reduce_by_area(law.threshold_on * on - law.threshold_off * off, size))
+        return cls(torch.from_numpy(np.stack(changes)).double(), law)
+
+    def made(self, frames: Tensor) -> Tensor:
+        """Return the changes of the log light of frames [N, h, w], white levels, [N - 1, h, w]."""
+        light = WHITE_DN * frames.double().clamp_min(1e-3).numpy()
+        return torch.from_numpy(np.diff(self.law.level(light), axis=0))
+
+
+def share_held(
+    images: Tensor,
+    changes: EventChanges,
+    position_m: NDArray,
+    average: Tensor,
+    operator: FrameOperator,
+    canvas: Plane,
+) -> float:
+    """Return the share of what a sequence's images show beyond the average object that its events hold.
+
+    (|m y - g0 m D(x0)|^2 - |m y - g m D(x)|^2) / |g m D(x) - g0 m D(x0)|^2, with D the changes of the log light
+    from position to position of what the images show in the mean, x, and of the average target x0; the rest is
+    as in `explained`. 1 = events change as the images say; 0 = they are as near to the average object; below 0:
+    nearer. Noise, which most events of a dim wall are, drops out in the mean.
+
+    Args:
+        images: Images of the canvas, float32 [N, H, W], 0..1.
+        changes: What the events say.
+        position_m: The target's centre in each, (x, y) in metres, [N, 2].
+        average: The average target, [P, P].
+        operator: The setup.
+        canvas: Geometry of the images.
+    """
+    found = on_target_plane(images, canvas, position_m).mean(dim=0)[0]
+    seen = _moving(changes.change)
+    shown, plain = (
+        _moving(changes.made(operator(on_canvas(one, canvas, position_m)))) for one in (found, average)
+    )
+    apart = max(_gain(shown, seen), 0.0) * shown - max(_gain(plain, seen), 0.0) * plain
+    nearer = _left(plain, seen) - _left(shown, seen)
+    return float(nearer / apart.square().sum().clamp_min(torch.finfo(torch.float64).tiny))
+
+
 def light_gain(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> float:
     """Return how much brighter the moving light of frames is than the setup makes it from images.
 
@@ -187,7 +264,11 @@ def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
 
 @torch.inference_mode()
 def confidence_of(
-    weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator | None = None
+    weights: Weights,
+    samples: Samples,
+    images: Tensor,
+    operator: FrameOperator | None = None,
+    changes: EventChanges | None = None,
 ) -> ConfidenceReport | None:
     """Return the confidence in the images of one sequence; None where the weights or the motion do not tell.
 
@@ -196,6 +277,7 @@ def confidence_of(
         samples: The sequence.
         images: The network's images, float32 [N, H, W].
         operator: The calibrated setup, where it is known.
+        changes: What the events say, of images that were made from events alone; they are then the judge.
     """
     if why_no_confidence(weights, samples) is not None:
         return None
@@ -203,7 +285,12 @@ def confidence_of(
     seen = weights.modality.inputs(samples.frame, samples.surface)
     frames = torch.from_numpy(samples.frame)
     sequence = (seen, frames, images, samples.position_m)
-    return _report_of(weights.network, weights.confidence, *sequence, weights.sampling.canvas, operator)
+    known, canvas = weights.confidence, weights.sampling.canvas
+    if operator is None or changes is None:
+        return _report_of(weights.network, known, *sequence, canvas, operator)
+    share = share_held(images, changes, samples.position_m, known.mean, operator, canvas)
+    halves = halves_of(weights.network, seen, samples.position_m, canvas)
+    return known.judge(images, halves, share, "events")
 
 
 def why_no_confidence(weights: Weights, samples: Samples) -> str | None:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -283,7 +283,11 @@ class Verdict:
 
 
 def verdict_on(
-    setup: Setup | None, report: ConfidenceReport | None, no_confidence: str | None = None
+    setup: Setup | None,
+    report: ConfidenceReport | None,
+    no_confidence: str | None = None,
+    frames: int = 1,
+    is_stated: bool = True,
 ) -> Verdict:
     """Return the verdict on a reconstruction.
 
@@ -291,14 +295,20 @@ def verdict_on(
         setup: The setup that the recording is taken to be of, where it is known and linear.
         report: How far to believe the images, where that can be told.
         no_confidence: Why it can't be told.
+        frames: Frames that an image is made of: all of a network of whole sequences, else 1.
+        is_stated: Whether the setup is that of the recording by somebody's word; else it is that of the
+            weights, and where nothing was measured it says nothing of this wall.
     """
+    known = setup is not None and setup.is_linear and (is_stated or report is None or report.measured)
     try:
-        wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
+        wall = identify(setup, replace(QUICK, frames=frames)).wall if known and setup is not None else ""
+        wall = wall if is_stated else wall.replace(" of this wall", " of the wall that these weights know", 1)
     except MissingDependencyError as error:  # of handwriting; the images stand without the answer
         wall = f"what the wall allows is not known: {error}"
     if report is None:
         return Verdict(wall, no_confidence or "", GUESSED[None])
-    return Verdict(wall, report.verdict, GUESSED[report.measured])
+    untold = report.measured and report.explained is None  # halves that agree may agree on a habit
+    return Verdict(wall, report.verdict, GUESSED[None if untold else report.measured])
 
 
 def result_at_noise(

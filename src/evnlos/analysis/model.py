@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.analysis.confidence import (
+    EventChanges,
     FrameOperator,
     confidence_of,
     consistent,
@@ -193,7 +194,10 @@ class Model:
             inputs = eyes.inputs(seen.frame, seen.surface)
             images = weights.network.infer(inputs, seen.position_m, so_far=True)
             return Reconstruction(images, samples, warnings=warnings, no_confidence=_SO_FAR, brought_from=level)
-        confidence = confidence_of(weights, seen, images, operator)
+        changes, times = None, capture.frame_times_us[-len(samples) :]
+        if operator is not None and judge is not None and "frame" not in eyes.slices:
+            changes = EventChanges.of(capture.events, times, judge.pixel, operator.size)
+        confidence = confidence_of(weights, seen, images, operator, changes)
         found = Reconstruction(
             images, samples, confidence, warnings, no_confidence=unjudged, brought_from=level
         )

@@ -366,7 +366,7 @@ class LiveCommand:
                     model = load_model(name)
                     say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
                 engine = Engine(model.weights)
-                verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE)
+                verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE, is_stated=False)
                 run = Run(source, engine, self.pace)
                 sinks = []
                 if not self.headless:

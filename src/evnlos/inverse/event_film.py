@@ -43,7 +43,7 @@ from evnlos.types import Plane
 
 @dataclass(frozen=True, eq=False)
 class FilmLight(SequenceLight):
-    """Light of a film of K modes between T nodes: I(i, t_j) = still(i) + left(i) w_j, white levels.
+    """Light of a film of K modes between T nodes: I(i, t_j) = still(i, t_j) + left(i) w_j, white levels.
 
     `left` [P, K] is what a pixel sees of each mode; `right` holds no target.
     """
@@ -54,12 +54,12 @@ class FilmLight(SequenceLight):
 
         Args:
             left: What each pixel sees of each mode, white levels [P, K].
-            still: Light without the plane, white levels [P].
+            still: Light without these modes, white levels [P, T].
             times_s: Nodes, [T], seconds, equally spaced.
             shape: Size (H, W) of the images, P = H W.
         """
         right = np.zeros((len(times_s), left.shape[1], 1))
-        return cls(left, right, still[:, None].astype(np.float32), times_s, shape)
+        return cls(left, right, still.astype(np.float32), times_s, shape)
 
     def __call__(self, z: Array) -> Array:
         """Return the light of a film w, [T K], white levels, [P, T]."""
@@ -139,12 +139,10 @@ class FilmFrames(NamedTuple):
     """From the plane's cells to white levels of their pixels [H, W]."""
     frames: torch.Tensor
     """White levels without known ambient light, [N, H, W]."""
-    times_s: Array
-    """Their times, [N], seconds, on the clock of the events."""
     noise_std: torch.Tensor
-    """Standard deviation of a pixel's noise, white levels, [H, W]."""
-    static: float
-    """That of its constant offset over it."""
+    """Standard deviation of a pixel's noise, white levels, [H, W], before the film's `noise_factor`."""
+    film: FilmEstimate
+    """What they tell alone, on the clock of the events (`estimate_film`): the prior, and the modes left out."""
 
 
 _MODES = 64  # strongest modes of a film that are asked for, at most
@@ -172,7 +170,8 @@ def estimate_event_film(
 ) -> FilmEstimate:
     """Return the film of a hidden plane from the events of the wall, and from frames beside them.
 
-    At most 64 of the strongest modes are asked for; what the others may hold is part of the deviation.
+    At most 64 of the strongest modes are asked for; the others are those of the frames alone, on a line from
+    one to the next, and what they may hold is part of the deviation.
 
     Args:
         operator: A, from the plane's cells to white levels of the event camera's pixels, [H, W].
@@ -181,8 +180,8 @@ def estimate_event_film(
         law: Constants of the event model.
         times_s: Nodes: times of the images, [T], seconds, increasing, equally spaced.
         frames: Frames beside them; None = events alone.
-        prior: The prior, as of frames; None: of bright shapes on black that move by a twentieth of the plane's
-            side in a second. Its mean is a brightness of 0.25.
+        prior: The prior; None: that of the frames, or of bright shapes on black that move by a twentieth of the
+            plane's side in a second. Its mean is a brightness of 0.25.
         settings: What the likelihood of events takes for granted; None is the default.
         progress: Called with each iteration.
 
@@ -206,6 +205,8 @@ def estimate_event_film(
     ambient = dark.flatten().numpy()
     relative = matrix / np.maximum(ambient + _BRIGHT * matrix.sum(axis=1), 1e-9)[:, None]
     side = max(plane.extent_m)
+    if prior is None and frames is not None:
+        prior = frames.film.prior
     found = prior or FilmPrior(_DEVIATION, _RESTING, side * _LENGTH, side * _SPEED)
     values, basis = film_modes(relative.T @ relative, plane, found.length_m)
     flat = np.asarray(np.linalg.solve(basis, np.full(len(basis), _BRIGHT)), np.float64)
@@ -216,12 +217,17 @@ def estimate_event_film(
         )
     kept = np.argsort(values)[::-1][:modes]
     hidden = np.square(np.delete(basis, kept, axis=1)).sum(axis=1)
-    light = FilmLight.of(matrix @ basis[:, kept], ambient, times, (dark.shape[0], dark.shape[1]))
-    count, cells = len(times), basis[:, kept]
-    own = _precision(found, times, wave_numbers(cells, plane))
-    known = None if frames is None else _of_frames(frames, cells, times)
+    count, cells, shape = len(times), basis[:, kept], (dark.shape[0], dark.shape[1])
     middle = np.tile(flat[kept], count)
-    w: Array = middle.copy()
+    begun = np.full((count, len(basis)), _BRIGHT)
+    if frames is not None:
+        alone = frames.film.mean.reshape(len(frames.film.times_s), -1)
+        begun = _on_line(frames.film.times_s, alone, times)
+    w = np.asarray((begun @ np.linalg.inv(basis).T)[:, kept], np.float64).ravel()
+    rest = begun - w.reshape(count, -1) @ cells.T  # the modes left out
+    light = FilmLight.of(matrix @ cells, ambient[:, None] + matrix @ rest.T, times, shape)
+    own = _precision(found, times, wave_numbers(cells, plane))
+    known = None if frames is None else _of_frames(frames, cells, rest, times)
     trust, annealed = np.ones(len(record)), max(settings.iterations - _SETTLED, 1)
     factor = np.empty((0, 0)), True
     turns = range(settings.iterations)
@@ -230,21 +236,22 @@ def estimate_event_film(
         least = settings.first_noise ** (1 - share) * settings.least_noise**share
         rows = rows_of(light, law, record, w, least, trust)
         total = film_equations(film_rows(light, record, rows), light, law.threshold_sigma)
-        if known is not None:
+        if known is None:
+            _hold_up(total, w, cells, rest)
+        else:
             total.information += known.information
             total.score += known.score - known.information @ w
-        _hold_up(total, w, cells)
         factor = cho_factor(total.information + own, lower=True, overwrite_a=True)
         step = cho_solve(factor, total.score - own @ (w - middle))
         spread = found.deviation * math.hypot(1.0, found.resting)
-        w += step * min(1.0, _STEP * spread / max(float(np.abs(step).max()), 1e-12))
+        w = w + step * min(1.0, _STEP * spread / max(float(np.abs(step).max()), 1e-12))
     covariance = cho_solve(factor, np.eye(len(w)))
     blocks = covariance.reshape(count, modes, count, modes)[np.arange(count), :, np.arange(count)]
     variance = np.einsum("ck,tkl,cl->tc", cells, blocks, cells, optimize=True)
     variance += (found.deviation**2 * (1 + found.resting**2)) * hidden
-    images = (_BRIGHT + (w - middle).reshape(count, modes) @ cells.T).reshape(-1, *plane.shape)
+    images = (w.reshape(count, modes) @ cells.T + rest).reshape(-1, *plane.shape)
     deviation = np.sqrt(np.maximum(variance, 0.0)).reshape(-1, *plane.shape)
-    static = 0.0 if frames is None else frames.static
+    static = 0.0 if frames is None else frames.film.static
     return FilmEstimate(times, images, deviation, found, math.nan, 1.0, static)
 
 
@@ -321,28 +328,36 @@ def film_equations(rows: FilmRows, light: FilmLight, spread: float) -> NormalEqu
     return NormalEquations(whole.transpose(0, 2, 1, 3).reshape(count * modes, -1), score.ravel())
 
 
-def _of_frames(frames: FilmFrames, cells: Array, nodes: Array) -> NormalEquations:
-    """Return what frames say of a film w [T K], their pixels' constant offsets integrated out."""
-    check_film(frames.operator, frames.frames, frames.times_s, frames.noise_std, frames.static, None)
-    weight = 1 / frames.noise_std.double().flatten().numpy()
-    left = weight[:, None] * (frames.operator.dense(torch.float64).numpy() @ cells)
-    data = frames.frames.double().flatten(1).numpy() * weight
-    hats = np.stack([np.interp(frames.times_s, nodes, one) for one in np.eye(len(nodes))], axis=1)
-    offsets = np.full((len(data),) * 2, frames.static**2 / (1 + len(data) * frames.static**2))
+def _on_line(times_s: Array, values: Array, nodes: Array) -> Array:
+    """Return values [N, C] at times on a line between them at nodes, [T, C]."""
+    return np.stack([np.interp(nodes, times_s, one) for one in values.T], axis=1)
+
+
+def _of_frames(frames: FilmFrames, cells: Array, rest: Array, nodes: Array) -> NormalEquations:
+    """Return what frames say of a film w [T K] beside the rest; constant offsets are integrated out."""
+    times, static = frames.film.times_s, frames.film.static
+    check_film(frames.operator, frames.frames, times, frames.noise_std, static, None)
+    weight = 1 / (frames.film.noise_factor * frames.noise_std.double().flatten().numpy())
+    matrix = weight[:, None] * frames.operator.dense(torch.float64).numpy()
+    left = matrix @ cells
+    data = frames.frames.double().flatten(1).numpy() * weight - _on_line(nodes, rest, times) @ matrix.T
+    hats = _on_line(nodes, np.eye(len(nodes)), times)
+    offsets = np.full((len(data),) * 2, static**2 / (1 + len(data) * static**2))
     apart = hats.T @ (np.eye(len(data)) - offsets)
     information = np.asarray(np.kron(apart @ hats, left.T @ left), np.float64)
     return NormalEquations(information, np.asarray((apart @ data) @ left, np.float64).ravel())
 
 
-def _hold_up(total: NormalEquations, w: Array, cells: Array) -> None:
+def _hold_up(total: NormalEquations, w: Array, cells: Array, rest: Array) -> None:
     """Add that no cell is darker than black: exp(-x^2 / 2 s^2) where its brightness x is below 0."""
     films = w.reshape(-1, cells.shape[1])
     modes = films.shape[1]
     for k, film in enumerate(films):
-        dark = cells[cells @ film < 0] / _BLACK
-        here = slice(k * modes, (k + 1) * modes)
-        total.information[here, here] += dark.T @ dark
-        total.score[here] -= dark.T @ (dark @ film)
+        level = cells @ film + rest[k]
+        dark = level < 0
+        pull, here = cells[dark] / _BLACK, slice(k * modes, (k + 1) * modes)
+        total.information[here, here] += pull.T @ pull
+        total.score[here] -= pull.T @ (level[dark] / _BLACK)
 
 
 def _precision(prior: FilmPrior, times_s: Array, wave_number: Array) -> Array:

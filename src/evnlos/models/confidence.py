@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -90,7 +91,8 @@ class ConfidenceReport:
         high: Upper end.
         explained: Share of what the average object leaves unexplained in the frames that the images explain,
             where the setup is known; 0 or less is no better than the average object, and `CONFIRMED` is the
-            least that is believed.
+            least that is believed. By events: share of what the images show beyond it that the events hold.
+        judged_by: What tells the share, frames or events.
     """
 
     agreement: float
@@ -98,6 +100,7 @@ class ConfidenceReport:
     low: Tensor
     high: Tensor
     explained: float | None = None
+    judged_by: Literal["frames", "events"] = "frames"
 
     @property
     def support(self) -> float:
@@ -113,12 +116,16 @@ class ConfidenceReport:
     @property
     def verdict(self) -> str:
         """One sentence for a reader."""
-        explained = 100 * max(self.explained or 0, 0)
+        explained, by = 100 * min(max(self.explained or 0, 0), 1), self.judged_by
         if self.agreement > self.threshold and not self.measured:
+            shares = {
+                "frames": f"it explains {explained:.0f} % of what this object adds to the frames",
+                "events": f"the events hold {explained:.0f} % of what it shows beyond an average object",
+            }
             return (
-                f"nothing measured, do not trust this reconstruction: it explains {explained:.0f} % of what "
-                f"this object adds to the frames ({100 * CONFIRMED:.0f} % are required); check distance and "
-                "wall, which may not be those of the weights or of the setup"
+                f"nothing measured, do not trust this reconstruction: {shares[by]} "
+                f"({100 * CONFIRMED:.0f} % are required); check distance, light and wall, which may not be "
+                "those of the weights or of the setup"
             )
         if not self.measured:
             return (
@@ -127,8 +134,12 @@ class ConfidenceReport:
                 f"where sequences without any object share up to {100 * self.threshold:.0f} %"
             )
         frames = f", and the images explain {explained:.0f} % of its frames"
+        if by == "events":
+            frames = f", and its events hold {explained:.0f} % of what the images show beyond an average one"
         if self.explained is None:
-            frames = "; whether the images explain its frames is not known, which takes the calibrated setup"
+            frames = (
+                "; whether the recording agrees with the images is not known, which takes the calibrated setup"
+            )
         agreed = f"{100 * min(max(self.agreement, 0), 1):.0f} %"
         return f"both halves of the sequence agree on {agreed} of what distinguishes this object{frames}"
 
@@ -156,18 +167,25 @@ class Confidence:
     low: Tensor
     high: Tensor
 
-    def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> ConfidenceReport:
+    def judge(
+        self,
+        pictures: Tensor,
+        halves: Tensor,
+        explained: float | None = None,
+        judged_by: Literal["frames", "events"] = "frames",
+    ) -> ConfidenceReport:
         """Return the confidence in the images of a sequence.
 
         Args:
             pictures: Images of all positions, float [N, H, W], 0..1.
             halves: What the two halves of the sequence show of the target, [2, 32, 32]: see `halves_of`.
-            explained: How much of the frames the images explain, where the setup is known.
+            explained: How much of the frames the images explain, or of the images the events hold, where the
+                setup is known.
+            judged_by: Which of the two.
         """
         agreement, threshold = float(self.agreement(halves)), float(self.threshold)
-        blank = ConfidenceReport(
-            agreement, threshold, torch.zeros_like(pictures), torch.ones_like(pictures), explained
-        )
+        ends = torch.zeros_like(pictures), torch.ones_like(pictures)
+        blank = ConfidenceReport(agreement, threshold, *ends, explained, judged_by)
         if not blank.measured:
             return blank
         group = int(torch.searchsorted(self.edges, torch.tensor(agreement)))

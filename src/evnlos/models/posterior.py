@@ -425,17 +425,17 @@ def estimate_film_of(
         found = estimate_film(operator, light, times, noise, static=static)
         if evidence == "frames":
             return found
-        frames = FilmFrames(operator, light, times, noise * found.noise_factor, found.static)
+        frames = FilmFrames(operator, light, noise, found)
     size = (capture.events.height, capture.events.width)
     seen, span = setup.seen_by(size), (float(times[0]), float(times[-1]))
     still = seen.ambient_light(size)
     law = setup.pixel.known_law(WHITE_DN * float(still.mean()))
     record = record_of(capture.events, law, span, _GAP_S)
     count = max(len(times), round((span[1] - span[0]) / _FILM_STEP_S) + 1)
-    nodes, prior = np.linspace(*span, count), None if found is None else found.prior
+    nodes = np.linspace(*span, count)
     from threadpoolctl import threadpool_limits  # whose import changes the environment
 
     with threadpool_limits(1):
         return estimate_event_film(
-            seen.operator(plane, size), still, record, law, nodes, frames=frames, prior=prior, progress=progress
+            seen.operator(plane, size), still, record, law, nodes, frames=frames, progress=progress
         )

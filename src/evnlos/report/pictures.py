@@ -263,9 +263,8 @@ def reconstruct_capture(
         if made.brought_from is not None:
             found["brought_from"] = made.brought_from
         if confidence is not None:
-            save_png(
-                draft / "unsure.png", strip([grey(one) for one in (confidence.high - confidence.low)[own]]), 2
-            )
+            width = strip([grey(one) for one in (confidence.high - confidence.low)[own]])
+            save_png(draft / "unsure.png", width, 2)
             ends = torch.stack([confidence.low, confidence.high]).numpy()
             write_atomically(draft / "interval.npy", _npy(ends))
             found["confidence"] = confidence_values(confidence)
@@ -275,7 +274,8 @@ def reconstruct_capture(
         if samples.truth is not None:
             truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
             found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
-        verdict = verdict_on(setup or model.known_setup(), confidence, made.no_confidence)
+        of = (len(images) if model.weights.network.sees_sequence else 1), setup is not None
+        verdict = verdict_on(setup or model.known_setup(), confidence, made.no_confidence, *of)
         found |= {"verdict": asdict(verdict), "in_words": _in_words(found, verdict, track)}
         title = f"{recording.name}, reconstructed by {found['weights']}"
         sheet = result_sheet(title, images.numpy(), samples, sampling, confidence, found["in_words"])
