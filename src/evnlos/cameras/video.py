@@ -281,7 +281,7 @@ def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Pa
     if not path.exists() and glob.has_magic(str(path)):
         found = [Path(one) for one in glob.glob(str(path))]  # noqa: PTH207 - the pattern may be absolute
         if not found:
-            raise DataError(f"{path}: no file fits that pattern; check the path")
+            raise DataError(no_file(path))
         return path, _named(found)[1]
     if not path.is_file():
         raise DataError(no_file(path))
