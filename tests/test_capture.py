@@ -158,6 +158,16 @@ DAMAGE = {
     "no frames": (lambda f: (f / "frames.csv").write_text("t_us,file\n"), "no frames"),
     "too wide": (_edit("capture.yaml", "width: 72", "width: 71"), "71"),
     "nan": (_edit("capture.yaml", "speed_m_s: 0.02", "speed_m_s: .nan"), "speed_m_s"),
+    "none": (_edit("capture.yaml", "events: events.raw", "events: none"), "takes none for the name of a file"),
+    "nothing": (
+        _edit("capture.yaml", "events: events.raw\nframes: frames.csv", "events: null\nframes: null"),
+        r"capture\.yaml: events and frames are null; state one of them",
+    ),
+    "no distance": (
+        _edit("capture.yaml", "distance_m: 0.3", "distance_m: -0.3"),
+        r"capture\.yaml: setup\.distance_m is -0\.3; give a finite number of metres above 0, or null",
+    ),
+    "nan distance": (_edit("capture.yaml", "distance_m: 0.3", "distance_m: .nan"), "distance_m is nan; give a"),
 }
 
 

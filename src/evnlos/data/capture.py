@@ -86,7 +86,7 @@ class Capture:
 
     @property
     def distance_m(self) -> float | None:
-        """From hidden object to wall, metres, as noted in `setup`; None where it is not, or is no length."""
+        """From hidden object to wall, metres, as noted in `setup`; None where it is not."""
         return noted_distance_m(self.info)
 
     @property
