@@ -307,7 +307,7 @@ def test_too_few_captures_and_unknown_names(folders, copies) -> None:
         read_capture_set(folders[:3], holdout=[f.name for f in folders[:2]])
     with pytest.raises(ConfigError, match="holdout_share"):
         Calibration(holdout_share=1.0)
-    with pytest.raises(DataError, match=r"distance_m is '30 cm'"):
+    with pytest.raises(ConfigError, match=r"distance_m is '30 cm'"):
         fit_setup(_with_distance(folders), Calibration())
 
 

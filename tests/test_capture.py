@@ -158,6 +158,16 @@ DAMAGE = {
     "no frames": (lambda f: (f / "frames.csv").write_text("t_us,file\n"), "no frames"),
     "too wide": (_edit("capture.yaml", "width: 72", "width: 71"), "71"),
     "nan": (_edit("capture.yaml", "speed_m_s: 0.02", "speed_m_s: .nan"), "speed_m_s"),
+    "none": (_edit("capture.yaml", "events: events.raw", "events: none"), "takes none for the name of a file"),
+    "nothing": (
+        _edit("capture.yaml", "events: events.raw\nframes: frames.csv", "events: null\nframes: null"),
+        r"capture\.yaml: events and frames are null; state one of them",
+    ),
+    "no distance": (
+        _edit("capture.yaml", "distance_m: 0.3", "distance_m: -0.3"),
+        r"capture\.yaml: setup\.distance_m is -0\.3; give a finite number of metres above 0, or null",
+    ),
+    "nan distance": (_edit("capture.yaml", "distance_m: 0.3", "distance_m: .nan"), "distance_m is nan; give a"),
 }
 
 
@@ -168,7 +178,42 @@ def test_a_damaged_capture_is_a_one_line_error_and_writes_nothing(damage: str, c
     with pytest.raises(EvnlosError, match=says) as caught:
         import_captures([capture], tmp_path / "d")
     assert "\n" not in str(caught.value)
-    assert not list((tmp_path / "d").glob("*.h5"))
+    assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.parametrize("kept", [(), ("notes.txt",)])
+def test_an_import_on_a_full_disk_leaves_what_was_there(kept, tiny_captures, tmp_path, monkeypatch) -> None:
+    (out := tmp_path / "a" / "d").mkdir(parents=True)
+
+    def full(path, *_, **__):
+        (out / "checks").mkdir()
+        (out / "checks" / "drawn.png").write_bytes(b"")
+        for name in kept:
+            (out / name).write_text("mine")
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("evnlos.data.capture.write_shard", full)
+    with pytest.raises(OSError, match="No space left"):
+        import_captures(tiny_captures[:1], out)
+    left = {one.name for one in out.iterdir()}
+    assert left == ({"notes.txt", "checks", "dataset.yaml", ".lock"} if kept else set())
+
+
+def test_an_import_that_fails_later_goes_on(tiny_captures, tmp_path, monkeypatch) -> None:
+    from evnlos.data.store import write_shard
+
+    def fails(path, *args, **more):
+        if "first" in done:
+            raise OSError(28, "No space left on device", str(path))
+        done.append("first")
+        write_shard(path, *args, **more)
+
+    done: list[str] = []
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+        patch.setattr("evnlos.data.capture.write_shard", fails)
+        import_captures(tiny_captures[:2], tmp_path / "d")
+    assert len(list((tmp_path / "d").glob("*.h5"))) == 1 and (tmp_path / "d" / "dataset.yaml").is_file()
+    assert not import_captures(tiny_captures[:2], tmp_path / "d").missing()
 
 
 def test_a_capture_without_events_is_refused(capture, tmp_path) -> None:

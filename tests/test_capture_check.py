@@ -402,7 +402,7 @@ def test_what_pixels_do_by_themselves_is_no_bad_clock(shared_data, name, level) 
     """The captures whose pixels are furthest from the expected ones: 0.11, 0.10, 0.06 s without an offset."""
     capture = read_capture(shared_data / "captures" / name)
     assert offset_level(capture) == level
-    assert offset_level(capture, 300_000) == offset_level(capture, -300_000) == "bad"
+    assert offset_level(capture, 350_000) == offset_level(capture, -350_000) == "bad"
 
 
 def test_the_middle_course_says_that_it_cannot_be_told(shared_data) -> None:
@@ -420,7 +420,7 @@ def test_rates_of_false_alarms_and_of_shifts_that_are_found(shared_data, tmp_pat
         captures += [read_capture(folder) for folder in sorted(out.glob(f"{name}_*"))]
     assert [one.name for one in captures if offset_level(one) == "bad"] == []
     some = [one for one in captures if one.name[-1] in "04ABGKT"]
-    for shift_us, not_good, bad in ((100_000, 0.4, 0.1), (200_000, 0.9, 0.7)):
+    for shift_us, not_good, bad in ((100_000, 0.4, 0.0), (200_000, 0.9, 0.3), (300_000, 0.95, 0.8)):
         found = [offset_level(one, sign * shift_us) for one in some for sign in (-1, 1)]
         shares = sum(level != "good" for level in found), sum(level == "bad" for level in found)
         print(f"{shift_us / 1e6:g} s: not good {shares[0]}, bad {shares[1]} of {len(found)}")

@@ -114,6 +114,19 @@ def test_each_second_or_third_row_and_column_is_used_of_a_region(tmp_path, every
             read_capture(folder)
 
 
+def test_frames_of_0_to_1_are_told_what_a_capture_takes(tmp_path):
+    folder = folder_of(tmp_path, events="e.h5", frames="f.npy")
+    write_events(folder / "e.h5", stream())
+    np.save(folder / "f.npy", pictures() / pictures().max())
+    with pytest.raises(EvnlosError, match=r"is 1; save whole numbers of 16 bits.*white_dn") as caught:
+        read_capture(folder)
+    assert "--white" not in str(caught.value)
+    np.save(folder / "f.npy", np.rint(4095 * (pictures() / pictures().max())).astype(np.uint16))
+    text = (folder / "capture.yaml").read_text()
+    (folder / "capture.yaml").write_text(text.replace("width:", "white_dn: 4095\n  width:", 1))
+    assert read_capture(folder).frames.max() == 65_535
+
+
 def test_frames_that_are_not_finite_are_refused(tmp_path):
     folder = folder_of(tmp_path, events="e.h5", frames="f.npy")
     write_events(folder / "e.h5", stream())

@@ -269,6 +269,13 @@ def test_a_misspelt_command_names_the_nearest(capsys) -> None:
         assert f"unknown command {word!r}; did you mean {meant!r}?" in said and "finetune" not in said
 
 
+def test_a_misspelt_option_before_any_command_names_the_nearest(capsys) -> None:
+    for word, meant in (("--verson", "--version"), ("--hlep", "--help"), ("--quite", "--quiet")):
+        assert f"unknown option {word!r}; did you mean {meant!r}?" in fails(capsys, word)
+    said = fails(capsys, "-x")
+    assert "unknown option '-x'; give one of --version, --help" in said and "finetune" not in said
+
+
 def test_captures_that_are_not_there_match_nothing(tmp_path, capsys) -> None:
     said = fails(capsys, "demo", "--out", tmp_path / "none", "--captures", tmp_path / "nope" / "*")
     assert "nope/* matches nothing; give capture folders" in said and not (tmp_path / "none").exists()

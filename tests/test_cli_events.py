@@ -189,6 +189,7 @@ def test_wrong_videos_and_settings_leave_nothing(tmp_path: Path, capsys, monkeyp
     broken[75, 3, 4] = np.nan
     np.save("broken.npy", broken)
     Path("text.mp4").write_text("no video")
+    Path("empty").mkdir()
     Path("there.h5").write_bytes(b"precious")
     before = left_in(tmp_path)
 
@@ -199,6 +200,7 @@ def test_wrong_videos_and_settings_leave_nothing(tmp_path: Path, capsys, monkeyp
 
     good = ["clip.npy", "--fps", 30, "--out", "e.h5"]
     refuses("no such file", "absent.mp4", "--out", "e.h5")
+    refuses("empty holds neither videos nor images; give a folder of videos, or", "empty", "--out", "e.h5")
     refuses("text.mp4: not a video", "text.mp4", "--out", "e.h5")
     refuses("1 frame", "one.npy", "--fps", 30, "--out", "e.h5")
     refuses("give --fps", "clip.npy", "--out", "e.h5")

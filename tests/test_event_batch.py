@@ -149,6 +149,8 @@ def test_windows_are_slices_by_time_and_a_loader_takes_them() -> None:
     overlapping = EventWindows(events, 2000, stride_us=500, transform=len)
     first = int(events.t_us[0]) - 1
     assert overlapping[1] == len(events.between(first + 500, first + 2500)) and overlapping[-1] > 0
+    with pytest.raises(DataError, match=r"'e\.raw' is no stream of events; give evnlos\.read_events\(FILE\)"):
+        EventWindows("e.raw", 5)  # type: ignore[arg-type]
     for wrong in (lambda: EventWindows(events[:0], 5), lambda: EventWindows(events, 0)):
         with pytest.raises(DataError, match="positive lengths"):
             wrong()

@@ -396,6 +396,11 @@ def test_what_samples_and_weights_must_share(tmp_path: Path) -> None:
     for another in (made["other"], replace(made["here"], setup=str(tmp_path / "gone")), Sampling()):
         with pytest.raises(DataError, match="make them alike"):
             check_sampling(sees["event"], another)
+    words = r"of surface sae, and these have surface likelihood; .* made with --sampling\.surface sae, or"
+    with pytest.raises(DataError, match=words):
+        check_sampling(Weights(plan.build("event", Sampling())), made["here"])
+    with pytest.raises(DataError, match=r"and these have surface sae, setup none; .*--sampling\.setup \S*here"):
+        check_sampling(sees["event"], Sampling())
     for fits in (made["other"], Sampling(surface="hots", tau_s=0.1)):
         check_sampling(sees["frame"], fits)
     with pytest.raises(DataError, match="make them alike"):

@@ -172,7 +172,9 @@ def test_a_dry_run_counts_the_walls_that_are_drawn(tmp_path, monkeypatch) -> Non
     assert "walls: 6 to prepare, 19.00 s of CPU each" in lines
     assert f"time: about {(objects + 6 * 19) / 180:.0f} min with 3 processes" in " ".join(lines)
     assert estimate(replace(config, setups=0), workers=3).walls == objects
-    assert estimate(replace(config, vary={}), workers=3).preparation_s == 0
+    one = estimate(replace(config, vary={}), workers=3)  # whose light path each process renders
+    assert (one.cpu_s, one.preparation_s, one.walls) == (1, 19, 3)
+    assert estimate(replace(config, vary={}), workers=3).walls == 0  # rendered before: nothing to tell
 
 
 def test_a_dry_run_needs_no_module_that_windows_lacks(tiny, tmp_path, monkeypatch) -> None:

@@ -186,6 +186,21 @@ def test_what_a_dead_process_left_goes_with_the_next(tmp_path) -> None:
     assert [path.name for path in (tmp_path / "folder").iterdir()] == ["whole"]
 
 
+def test_a_folder_that_nothing_came_into_goes_again(tmp_path) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    for folder in (tmp_path / "new" / "d", there):
+        with suppress(ZeroDivisionError), directory_lock(folder):
+            raise ZeroDivisionError
+        with suppress(ZeroDivisionError), new_folder(folder / "e"):
+            raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == [there] and not list(there.iterdir())
+    with suppress(ZeroDivisionError), directory_lock(there):
+        (there / "begun").write_text("half")
+        raise ZeroDivisionError
+    assert {one.name for one in there.iterdir()} == {".lock", "begun"}
+
+
 def test_shares_exclude_the_whole_and_not_each_other(tmp_path) -> None:
     """Else the whole would sweep away what a share is writing."""
     folder = tmp_path / "d"

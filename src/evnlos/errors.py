@@ -1,8 +1,10 @@
 """The errors that bad input raises, one sentence with value, limit and cure, and how texts are printed."""
 
+import glob
 import logging
 import re
 import sys
+from pathlib import Path
 from typing import Any, TextIO
 
 _UNSEEN = "\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff"
@@ -27,6 +29,20 @@ def printable(text: object, *, lines: bool = False) -> str:
     """
     pattern = _CONTROLS_OF_LINES if lines else _CONTROLS
     return pattern.sub(lambda found: found[0].encode("unicode_escape").decode(), str(text))
+
+
+def absent(path: str | Path, what: str = ": no such file") -> str:
+    """Return the beginning of a message on a path that is not there; a pattern matches nothing.
+
+    Args:
+        path: The path, or the pattern.
+        what: What to say of it where it is no pattern, with what parts it from the path.
+
+    Example:
+        >>> absent("shot_R", " is not a folder"), absent("shot_*", " is not a folder")
+        ('shot_R is not a folder', 'shot_* matches nothing')
+    """
+    return f"{path} matches nothing" if glob.has_magic(str(path)) else f"{path}{what}"
 
 
 class StderrHandler(logging.Handler):

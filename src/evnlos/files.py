@@ -54,14 +54,6 @@ def new_file(path: str | PathLike[str]) -> Iterator[Path]:
     Raises:
         DataError: The name is that of a folder, a device or a pipe.
         OSError: The file can't be written; none is left.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "a.txt"
-        >>> with new_file(path) as temporary:
-        ...     _ = temporary.write_text("whole")
-        >>> path.read_text(), len(list(path.parent.iterdir()))
-        ('whole', 1)
     """
     _sweep(Path(path).parent)
     with _in_place_of(Path(path)) as temporary:
@@ -87,23 +79,37 @@ def new_folder(path: str | PathLike[str]) -> Iterator[Path]:
         with _held(path, _busy(path)):
             yield from _filled(path)
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(path.parent)
-    if any(_unfinished_of(name, path.name) for name in [entry.name for entry in path.parent.iterdir()]):
-        raise DataError(_busy(path))
-    draft = path.with_name(_unfinished(path.name))
-    try:
-        draft.mkdir()
-        yield draft
-        _synchronise(draft)
-        check_folder(path)
+    with _made(path.parent):
+        _sweep(path.parent)
+        if any(_unfinished_of(name, path.name) for name in [entry.name for entry in path.parent.iterdir()]):
+            raise DataError(_busy(path))
+        draft = path.with_name(_unfinished(path.name))
         try:
-            draft.rename(path)
-        except OSError:
-            check_folder(path)  # another process was quicker by less than the check before
+            draft.mkdir()
+            yield draft
+            _synchronise(draft)
+            check_folder(path)
+            try:
+                draft.rename(path)
+            except OSError:
+                check_folder(path)  # another process was quicker by less than the check before
+                raise
+        except BaseException:
+            shutil.rmtree(draft, ignore_errors=True)
             raise
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Make a folder, with those above it; where the block fails, those that were made go again if empty."""
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
     except BaseException:
-        shutil.rmtree(draft, ignore_errors=True)
+        with suppress(OSError):
+            for one in made:
+                one.rmdir()
         raise
 
 
@@ -154,7 +160,7 @@ def check_folder(folder: str | Path) -> None:
 def directory_lock(
     folder: str | Path, part: str = "", *, check: Callable[[], object] | None = None
 ) -> Iterator[Path]:
-    """Hold a folder for this process; make it where it is not there yet.
+    """Hold a folder for this process; make it where it is not there, and take it away where nothing came.
 
     Whoever holds the whole of it removes unfinished files of processes that were killed. Processes that hold
     parts don't exclude each other, but one that wants the whole; where the system has no shared locks
@@ -168,19 +174,25 @@ def directory_lock(
     Raises:
         DataError: Another process holds it.
     """
-    folder = Path(folder)
-    if check is not None and not _is_lock(folder / LOCK):
+    folder, lock = Path(folder), Path(folder) / LOCK
+    if check is not None and not _is_lock(lock):
         check()
-    folder.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as held:
-        held.enter_context(_held(folder / LOCK, _busy(folder), is_shared=bool(part)))
+    is_new = not (part or lock.exists())
+    with _made(folder), ExitStack() as held:
+        held.enter_context(_held(lock, _busy(folder), is_shared=bool(part)))
         if part:
             held.enter_context(_held(folder / f"{LOCK}-{part}", _busy(folder)))
-        if check is not None:
-            check()  # again: another process may have begun its own work meanwhile
-        if not part:
-            _sweep(folder, whole=True)
-        yield folder
+        try:
+            if check is not None:
+                check()  # again: another process may have begun its own work meanwhile
+            if not part:
+                _sweep(folder, whole=True)
+            yield folder
+        except BaseException:
+            if is_new and [*folder.glob("*")] == [lock]:
+                with suppress(OSError):  # a system may not let a file go that is open
+                    lock.unlink()
+            raise
 
 
 def _busy(folder: Path) -> str:
@@ -189,11 +201,7 @@ def _busy(folder: Path) -> str:
 
 @contextmanager
 def _held(path: Path, busy: str, *, is_shared: bool = False) -> Iterator[None]:
-    """Hold a lock on a file or folder, which the system releases when this process dies.
-
-    Raises:
-        DataError: Another process holds it; the text is `busy`.
-    """
+    """Hold a lock on a file or folder until this process ends; `DataError` of `busy` where another holds it."""
     try:
         import fcntl
     except ImportError:
@@ -210,6 +218,8 @@ def _held(path: Path, busy: str, *, is_shared: bool = False) -> Iterator[None]:
         except OSError:
             if not is_folder:  # file systems of a network may lock files alone
                 raise
+        if not path.exists():  # whoever held it has just taken it away
+            raise DataError(busy)
         yield
     finally:
         os.close(handle)
@@ -235,32 +245,26 @@ def _in_place_of(path: Path) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         raise DataError(f"{path} is no plain file but a folder, device or pipe; give the name of a file")
     temporary = path.with_name(_unfinished(path.name))
-    made = [folder for folder in path.parents if not folder.exists()]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        _synchronise(temporary)
-        temporary.replace(path)
-    except BaseException as error:
-        with suppress(AttributeError):  # PyAV's errors keep theirs
-            if isinstance(error, OSError) and error.filename == str(temporary):
-                error.filename = str(path)  # the name that a user knows
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-            for folder in made:
-                folder.rmdir()
-        raise
+    with _made(path.parent):
+        try:
+            yield temporary
+            _synchronise(temporary)
+            temporary.replace(path)
+        except BaseException as error:
+            with suppress(AttributeError):  # PyAV's errors keep theirs
+                if isinstance(error, OSError) and error.filename == str(temporary):
+                    error.filename = str(path)  # the name that a user knows
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
 
 
 def _synchronise(path: Path) -> None:
     """Wait until a file, or all in a folder, is on the disk: some systems tell only then that it is full."""
     for file in path.rglob("*") if path.is_dir() else (path,):
         if file.is_file():
-            handle = os.open(file, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
-            try:
+            with file.open("rb" if os.name == "posix" else "r+b") as handle:
                 os.fsync(handle)
-            finally:
-                os.close(handle)
 
 
 def _unfinished(name: str) -> str:
@@ -346,12 +350,8 @@ def fetch_file(address: str, kind: str, name: str, digest: str, out: Path, most_
         OSError: The address can't be reached, or the file not be written.
         DataError: The file is another one, or too large.
     """
-    size, found = 0, hashlib.sha256()
-    with (
-        _opened(address, f"{kind}/{name}") as source,
-        new_file(out / name) as draft,
-        draft.open("wb") as target,
-    ):
+    size, found, what = 0, hashlib.sha256(), f"{kind}/{name}"
+    with _opened(address, what) as source, new_file(out / name) as draft, draft.open("wb") as target:
         while block := source.read(1 << 20):
             size += len(block)
             if size > most_bytes:
@@ -359,10 +359,9 @@ def fetch_file(address: str, kind: str, name: str, digest: str, out: Path, most_
             found.update(block)
             target.write(block)
         if found.hexdigest() != digest:
-            raise DataError(
-                f"{address}: {kind}/{name} is not the listed file (SHA-256 {found.hexdigest()[:12]}..., not "
-                f"{digest[:12]}...); it was damaged or replaced: try again, or another address"
-            )
+            other = f"SHA-256 {found.hexdigest()[:12]}..., not {digest[:12]}..."
+            cure = "it was damaged or replaced: try again, or another address"
+            raise DataError(f"{address}: {what} is not the listed file ({other}); {cure}")
     return size
 
 

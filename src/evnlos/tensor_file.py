@@ -150,7 +150,6 @@ class TensorFile(Generic[Content]):
             {name: tensors[name].contiguous() for name in (*self.names, *self.later)},
             json.dumps({"format": self.format, "about": to_dict(about)}),
         )
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, content)
         return hashlib.sha256(content).hexdigest()[:16]
 

@@ -27,7 +27,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self, cast
 
-from evnlos.errors import DataError, EvnlosError
+from evnlos.errors import DataError, EvnlosError, absent
 
 if TYPE_CHECKING:  # they are slow to import, and not every command needs them
     import h5py
@@ -91,7 +91,7 @@ def no_file(path: Path) -> str:
         return f"{path} is a folder; give a file in it"
     if path.exists():
         return f"{path} is not a regular file but a device or a pipe; copy it into a file first"
-    return f"{path}: no such file; check the path"
+    return f"{absent(path)}; check the path"
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:

@@ -388,12 +388,13 @@ def check_sampling(weights: Weights, sampling: Sampling) -> None:
         DataError: Names the settings that differ.
     """
     made_for, these = weights.sampling, sampling if weights.modality.needs_events else sampling.of_frames()
-    # Only this surface is made through the setup, which may have been moved.
+    # Only this surface is made through the setup, which may have been moved. Its maps are alike whether errors
+    # are taken from them.
     is_known = not made_for.is_solved or same_setup(made_for.setup, these.setup)
-    these = these.shown_as(made_for)  # the maps are alike whether errors are taken from them
-    if not is_known or replace(made_for, setup="") != replace(these, setup=""):
-        differ = [name for name, value in vars(made_for).items() if value != getattr(these, name)]
-        trained, given = (", ".join(f"{n} {getattr(one, n)}" for n in differ) for one in (made_for, these))
-        raise DataError(
-            f"the weights were trained on samples of {trained}; these have {given}: make them alike"
-        )
+    asked, these = replace(made_for, setup=these.setup) if is_known else made_for, these.shown_as(made_for)
+    if not is_known or asked != these:
+        differ = [name for name, value in vars(asked).items() if value != getattr(these, name)]
+        trained, given = (", ".join(f"{n} {vars(s)[n] or 'none'}" for n in differ) for s in (asked, these))
+        cure = " ".join(f"--sampling.{n.replace('_', '-')} {getattr(asked, n)}" for n in differ)
+        what = f"the weights were trained on samples of {trained}, and these have {given}"
+        raise DataError(f"{what}; make them alike: a dataset made with {cure}, or other weights")

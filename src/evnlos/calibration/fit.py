@@ -291,14 +291,8 @@ def _at_known_distance(settings: Calibration, capture_set: CaptureSet) -> tuple[
     """Return the start at the measured distance of target and wall, and the names of what is known."""
     noted = capture_set.captures[0].info.setup.get("distance_m")
     setup = settings.start.setup
-    if noted is not None:
-        if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not noted > 0:
-            raise DataError(
-                f"{capture_set.names[0]}: setup.distance_m is {noted!r}; give the metres from target to "
-                "wall, above 0"
-            )
-        if setup.default_distance_m is not None:
-            setup = setup.with_parameters({"distance_m": float(noted)})
+    if noted is not None and setup.default_distance_m is not None:
+        setup = setup.with_parameters({"distance_m": float(noted)})
     return setup, () if settings.fit_distance else ("distance_m",)
 
 

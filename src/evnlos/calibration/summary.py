@@ -357,7 +357,6 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
             left far above the noise. Where events alone fit no better the setup is written, and warns.
     """
     check_out(out, force)
-    out.mkdir(parents=True, exist_ok=True)
     write_atomically(
         out / CALIBRATION_VALUES_FILE, json.dumps(calibration_values(fit, rows), indent=2).encode()
     )

@@ -121,6 +121,7 @@ def open_video(
     white: float | None = None,
     scale: str | None = None,
     colour: Colour | None = None,
+    white_cure: str = "give white=1 (--white 1) if 1 is white, 255 if not",
 ) -> Video:
     """Return a video that is read frame by frame, as light with the instants of its frames.
 
@@ -134,6 +135,7 @@ def open_video(
         white: Value of white in the file, 0.001 to 1e9; by default 255, or 65535 for 16 bits.
         scale: Size to work at, "WIDTHxHEIGHT" or a factor such as "0.5"; by default that of the file.
         colour: Colour to take of coloured frames; None is all of them, as grey.
+        white_cure: What to do, says the message, where floating-point frames end at 1 and `white` is not given.
 
     Raises:
         DataError: The path is absent, no video, or of one frame; or times are needed.
@@ -159,7 +161,7 @@ def open_video(
         )
     if fps is None and not source.timed:
         raise DataError(f"{shown}: {_UNTIMED}")
-    chosen = white or source.white or _white_of_floats(shown, source)
+    chosen = white or source.white or _white_of_floats(shown, source, white_cure)
     width, height = _working_size(scale, source.size)
     return Video(shown, width, height, source.frames, fps, slow_motion, tone, chosen, source, colour=colour)
 
@@ -281,7 +283,7 @@ def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Pa
     if not path.exists() and glob.has_magic(str(path)):
         found = [Path(one) for one in glob.glob(str(path))]  # noqa: PTH207 - the pattern may be absolute
         if not found:
-            raise DataError(f"{path}: no file fits that pattern; check the path")
+            raise DataError(no_file(path))
         return path, _named(found)[1]
     if not path.is_file():
         raise DataError(no_file(path))
@@ -307,6 +309,8 @@ def check_paths(paths: Sequence[Path], fps: float | None) -> None:
         _check_images(paths)
     inside = first.iterdir() if first.is_dir() else ()
     images = len(paths) > 1 or any(one.suffix.lower() in _PICTURES for one in inside)
+    if first.is_dir() and not images:
+        raise DataError(f"{first} holds neither videos nor images; give a folder of videos, or of images")
     if fps is None and (images or first.suffix.lower() == ".npy"):
         raise DataError(f"{first}: {_UNTIMED}")
 
@@ -328,11 +332,10 @@ def _named(paths: list[Path]) -> tuple[Path, PictureSource]:
     return paths[0], PicturesSource(paths)
 
 
-def _white_of_floats(path: Path, source: PictureSource) -> float:
+def _white_of_floats(path: Path, source: PictureSource, cure: str) -> float:
     """Return 255 for floating-point images, unless the first looks as if 1 were white."""
     _, picture = next(source.pictures())
     if 0 < float(np.max(picture)) <= 1.0:
-        cure = "give white=1 (--white 1) if 1 is white, 255 if not"
         raise DataError(f"{path}: the largest number of its first frame is {np.max(picture):g}; {cure}")
     return 255.0
 

@@ -118,7 +118,6 @@ class CalibrateCommand:
         else:
             print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
             print("\n\n".join(filter(None, (table(rows), residual_table(fit), steps_table(fit)))))
-        self.out.mkdir(parents=True, exist_ok=True)
         drawn(self.out / "check.png", lambda: draw_calibration(fit, self.out / "check.png"))
         for line in warnings_of(fit):
             say(f"warning: {line}")

@@ -163,7 +163,6 @@ class CornerCommand:
             true = np.array([np.interp(penumbra.times_s, truth[0], row) for row in truth[1]])
             errors = found["errors_deg"] = _errors(tracks, true)
         found["warnings"] = warnings_of(penumbra, tracks)
-        self.out.mkdir(parents=True, exist_ok=True)
         still = next(light for time_s, light in video if time_s >= self.start)
         shown = self.out / "result.png"
         found["picture"] = drawn(

@@ -34,6 +34,7 @@ from evnlos.data.lab import Lab, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
 from evnlos.data.sampling import split_of
 from evnlos.data.simulations import PRESETS, estimate, with_pictures
+from evnlos.data.store import CHECKS
 from evnlos.errors import ConfigError, DataError, EvnlosError, UnknownNameError
 from evnlos.files import check_folder, write_atomically
 from evnlos.machine import ProgressBars, counted
@@ -388,7 +389,7 @@ class ImportCommand:
         about = {"out": str(self.out), "split": dataset.split}
         result(self.json, about, f"{self.out}: {_counted(len(dataset.objects()))} ({counts})")
         if self.check_images and not self.json:
-            print(f"check images: {self.out / 'checks'}")
+            print(f"check images: {self.out / CHECKS}")
 
     def _look(self, capture: Capture) -> None:
         """Tell what was done to a capture, and draw it."""
@@ -396,4 +397,4 @@ class ImportCommand:
         if self.check_images:
             drawn = io.BytesIO()
             check_image(capture).save(drawn, "PNG")
-            write_atomically(self.out / "checks" / f"{capture.name}.png", drawn.getvalue())
+            write_atomically(self.out / CHECKS / f"{capture.name}.png", drawn.getvalue())

@@ -149,12 +149,14 @@ class EventsCommand:
         """Refuse, before any is opened, paths that are not there, no one video, or frames without times."""
         check_files(*self.video)
         try:
-            check_paths(_videos_in(self.video)[:1] or self.video, self.fps)
+            if self.video:
+                check_paths(_videos_in(self.video)[:1] or self.video, self.fps)
         except DataError as error:
             raise UnfitWordsError(str(error)) from None
 
     def run(self) -> None:
         """Simulate, with a progress bar over the frames, and print what came out."""
+        self.check_names()
         if videos := _videos_in(self.video):
             if self.preview is not None:
                 raise ConfigError("--preview shows one video; leave it out for a folder of videos")

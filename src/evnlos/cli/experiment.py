@@ -389,7 +389,6 @@ class LiveCommand:
         summary = run.statistics.summary() | about
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
-            out.mkdir(parents=True, exist_ok=True)
             write_atomically(out / "latency.json", (json.dumps(summary, indent=1) + "\n").encode())
         if self.json:
             print(json.dumps(summary | {"out": None if out is None else str(out)}))

@@ -242,9 +242,11 @@ def summary_of(verb: str) -> str:
 
 
 def _unknown(verb: str) -> str:
-    near = difflib.get_close_matches(verb.lower()[:40], VERBS, n=1)
-    cure = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(VERBS)}"
-    return f"unknown command {printable(verb[:80])!r}; {cure}"
+    is_option = verb.startswith("-")
+    known = ("--version", "--help", FLAG, PROGRESS_FLAG, QUIET_FLAG) if is_option else (*VERBS,)
+    near = difflib.get_close_matches(verb.lower()[:40], known, n=1)
+    cure = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(known)}"
+    return f"unknown {'option' if is_option else 'command'} {printable(verb[:80])!r}; {cure}"
 
 
 def _answer_at_once(verb: str, rest: list[str]) -> Any:

@@ -337,9 +337,9 @@ def check_there(resolve: Callable[[Any], object], *words: str | Path) -> None:
 
 
 def check_files(*paths: Path) -> None:
-    """Refuse files that are not there; what may be a pattern of names is left to those who expand it."""
+    """Refuse files that are not there, and patterns of names that match nothing."""
     for path in paths:
-        if not (path.exists() or glob.has_magic(str(path))):
+        if not (path.exists() or glob.glob(str(path))):  # noqa: PTH207 - it may be absolute
             raise UnknownNameError(no_file(path))
 
 

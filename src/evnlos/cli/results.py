@@ -329,7 +329,6 @@ class IdentifyCommand:
 
         written = list[str | None]()
         if self.out is not None:
-            self.out.mkdir(parents=True, exist_ok=True)
             for one in found:
                 path = self.out / f"identify_{one.name}.png"
                 written.append(drawn(path, partial(draw_identification, one, path)))

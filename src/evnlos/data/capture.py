@@ -31,7 +31,7 @@ from evnlos.data.sampling import (
     time_steps,
 )
 from evnlos.data.store import Dataset, claim_dataset, write_shard
-from evnlos.errors import DataError, UnknownNameError, printable
+from evnlos.errors import DataError, UnknownNameError, absent, printable
 from evnlos.events import CelexOptions, FrameStack, keep_known_polarity, read_events, read_triggers
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import LineMotion, Motion, Scene, SeveralTargets, Target
@@ -86,7 +86,7 @@ class Capture:
 
     @property
     def distance_m(self) -> float | None:
-        """From hidden object to wall, metres, as noted in `setup`; None where it is not, or is no length."""
+        """From hidden object to wall, metres, as noted in `setup`; None where it is not."""
         return noted_distance_m(self.info)
 
     @property
@@ -124,8 +124,8 @@ def captures_in(given: Iterable[Path]) -> list[Path]:
         is_one = (path / "capture.yaml").is_file()
         inside = [path] if is_one else [file.parent for file in path.glob("*/capture.yaml")]
         if not inside and not path.is_file():
-            what = "holds no capture.yaml" if path.exists() else "matches nothing"
-            raise UnknownNameError(f"{path} {what}; give capture folders, or the folder above them")
+            what = f"{path} holds no capture.yaml" if path.exists() else absent(path, " does not exist")
+            raise UnknownNameError(f"{what}; give capture folders, or the folder above them")
         found += inside
     if paths and not found:
         raise UnknownNameError(f"{paths[0]} is no capture folder; give folders with a capture.yaml")
@@ -167,7 +167,7 @@ def read_capture(
     folder = Path(folder)
     if not folder.is_dir() and not folder.is_file():
         raise UnknownNameError(
-            f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)"
+            f"{absent(folder, ' is not a folder')}; give the folder of a capture (it holds capture.yaml)"
         )
     info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic).in_colour(colour)
     name, folder = _name_of(folder), folder.parent if folder.is_file() else folder

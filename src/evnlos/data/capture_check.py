@@ -30,6 +30,7 @@ _DARK_DN, _BORDER = 3, 0.08
 _BLOCK = 6  # pixels: single ones tell nothing of the light
 _FEWEST_EVENTS = 2_000
 _SURELY = 1.5  # times what is usual
+_ALONE_US = 70_000  # beyond what cannot be told: dim slow pixels, simulated with equal clocks, reach 65 ms
 _CLEARLY = 1.2  # times the agreement of frames and events
 _FAR_M = 0.5  # behind that little light of a target reaches what a camera sees of the wall
 _WEAK_FLICKER = 0.15  # of the rate: what little lamps sway
@@ -316,13 +317,13 @@ def clock_offset(capture: Capture) -> Iterator[Finding]:
         return
     if capture.info.dark is None:
         blink = f"a black level of the frames makes some of it: give a dark frame (dark); {blink}"
-    way, told = "late" if lag.lag_us < 0 else "early", abs(lag.lag_us) > lag.unsure_us
+    way, told = "late" if lag.lag_us < 0 else "early", abs(lag.lag_us) > lag.unsure_us + _ALONE_US
     finding = _finding(
         "clock offset",
         abs(lag.lag_us) <= lag.limit_us,
         not told,
         f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
-        f"{lag.limit_us * 1e-6:.2f} s is usual, up to {lag.unsure_us * 1e-6:.2f} s cannot be told from what "
+        f"{lag.limit_us * 1e-6:.2f} s is usual, up to {(lag.unsure_us + _ALONE_US) * 1e-6:.2f} s cannot be told from what "
         "pixels do by themselves)",
         _offset_cure(capture.info, lag.lag_us) if told else f"to be sure, {blink}",
     )

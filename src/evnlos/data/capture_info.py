@@ -16,7 +16,6 @@ from evnlos.types import COLOURS, LUMA_601, Colour, Mosaic
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
 _MOST_EVERY = 16  # rows and columns of which one is used
-_TEMPLATE = Path(__file__).with_name("capture_template.yaml")
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,8 @@ class CameraInfo:
     @property
     def balance(self) -> float:
         """What a white target has in the frames as they are used, over what it has as grey (Rec. 601)."""
-        if self.colour is None or self.white_balance is None:
-            return 1.0
-        return balances(self.white_balance)[COLOURS.index(self.colour)]
+        white = self.white_balance or (1.0, 1.0, 1.0)
+        return 1.0 if self.colour is None else balances(white)[COLOURS.index(self.colour)]
 
 
 def balances(white: tuple[float, float, float]) -> list[float]:
@@ -268,6 +266,9 @@ class CaptureInfo:
             raise ConfigError(f"every is {self.every}; give 1 (all rows and columns) to {_MOST_EVERY}")
         if self.events is None and self.alignment != AlignmentInfo():
             raise ConfigError("alignment is to the events' clock, and events is null; leave alignment out")
+        z_m = self.setup.get("distance_m")
+        if z_m is not None and (type(z_m) not in (int, float) or not 0 < z_m < math.inf):
+            raise ConfigError(f"setup.distance_m is {z_m!r}; give a finite number of metres above 0, or null")
 
     def check_cameras(self, name: str | Path, *, frames: bool, events: bool) -> None:
         """Raise `DataError` where a capture has no frames, or no events, and they are needed."""
@@ -302,15 +303,16 @@ def read_capture_info(
     if folder.is_file():
         return _info_of_recording(folder, events_topic, frames_topic)
     if not (path := folder / "capture.yaml").is_file():
-        inside = sorted(one.parent.name for one in folder.glob("*/capture.yaml"))
-        held = f" (it holds {len(inside)}: {folder}/*)" if inside else ""
+        held = f" (it holds {n}: {folder}/*)" if (n := len([*folder.glob("*/capture.yaml")])) else ""
         raise ConfigError(f"{folder} holds no capture.yaml; give the folder of one capture{held}")
-    values = read_yaml(path)
-    others = values.get("others")
+    others = (values := read_yaml(path)).get("others")
     for one in (values.get("target"), *(others if isinstance(others, list) else ())):  # digits are characters
         if isinstance(one, dict) and type(one.get("name")) is int:
             one["name"] = str(one["name"])
-    return from_dict(CaptureInfo, values, source=str(path))
+    try:
+        return from_dict(CaptureInfo, values, source=str(path))
+    except ConfigError as error:  # what is wrong in itself, such as both cameras null, names no file
+        raise ConfigError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
 
 def _info_of_recording(path: Path, events_topic: str | None, frames_topic: str | None) -> CaptureInfo:
@@ -368,12 +370,9 @@ def begin_capture(
         raise DataError(f"{path} exists; edit it, or give another folder")
     if width < 1 or height < 1:
         raise DataError(f"the sensor is {width} x {height} pixels; give its width and height")
-    folder.mkdir(parents=True, exist_ok=True)
-    one_line = " ".join(name.replace(":", " ").split())
-    text = _TEMPLATE.read_text(encoding="utf-8").format(
-        name=one_line, width=width, height=height, events=events, frames=frames
-    )
-    write_atomically(path, text.encode())
+    words = {"name": " ".join(name.replace(":", " ").split()), "width": width, "height": height}
+    template = Path(__file__).with_name("capture_template.yaml").read_text(encoding="utf-8")
+    write_atomically(path, template.format(**words, events=events, frames=frames).encode())
     return path
 
 
@@ -396,5 +395,6 @@ def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
         raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
     if not there:
         how = f"{folder / by} names it, or leaves its name to the default; null where there is no such thing"
-        raise DataError(f"{path} does not exist; {how}")
+        meant = f"{folder / by} takes {name} for the name of a file; write null where there is no such thing"
+        raise DataError(meant if name.lower() == "none" else f"{path} does not exist; {how}")
     return path

@@ -175,7 +175,8 @@ def _video_frames(folder: Path, path: Path, info: CaptureInfo, most: int | None)
     timed = path.is_file() and path.suffix.lower() != ".npy"
     camera = info.camera
     colour = camera.colour if camera.mosaic is None else None
-    video = open_video(path, fps=None if timed else _rate(path, info), colour=colour)
+    cure = "save whole numbers of 16 bits, of which 65535, or camera: {white_dn: ...} in capture.yaml, is white"
+    video = open_video(path, fps=None if timed else _rate(path, info), colour=colour, white_cure=cure)
     if most is not None:
         _check_size(path, (video.frames or 1) * video.width * video.height * 2, most)
 

@@ -395,6 +395,4 @@ def read_others(folder: Path, info: CaptureInfo, times_us: NDArray[np.int64]) ->
 def noted_distance_m(info: CaptureInfo) -> float | None:
     """Return the distance from hidden object to wall that a capture notes, metres; None without one."""
     noted = info.setup.get("distance_m")
-    if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not 0 < noted < float("inf"):
-        return None
-    return float(noted)
+    return None if noted is None else float(noted)

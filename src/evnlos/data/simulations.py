@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from evnlos.data.lab import Lab
 
 S = TypeVar("S", Simulation, "Lab")
+_LEAST_S = 0.5  # of CPU to prepare a wall: less is not told
 
 
 def with_pictures(settings: S, folder: str) -> S:
@@ -199,7 +200,7 @@ class Estimate:
     Args:
         objects: Objects to simulate here.
         cpu_s: CPU time of one object, seconds, preparation left out.
-        preparation_s: CPU time to prepare one wall that `vary` draws, seconds; 0 where it draws none.
+        preparation_s: CPU time to prepare one wall (its light path), seconds; 0 where that is hardly any.
         walls: Walls to prepare, each process its own.
         shard_bytes: Size of one shard.
         worker_bytes: Peak memory of the process that simulated it; 0 where the system does not say.
@@ -221,13 +222,11 @@ class Estimate:
         place = next(path for path in (out, *out.resolve().parents) if path.is_dir())
         free = shutil.disk_usage(place).free
         seconds = (self.objects * self.cpu_s + self.walls * self.preparation_s) / self.workers
-        prepared = (
-            [f"walls: {self.walls} to prepare, {self.preparation_s:.2f} s of CPU each"] if self.walls else []
-        )
+        prepared = f"walls: {self.walls} to prepare, {self.preparation_s:.2f} s of CPU each"
         memory = _size(self.workers * self.worker_bytes) if self.worker_bytes else "not known on this system"
         return [
             f"objects: {self.objects}, {self.cpu_s:.2f} s of CPU and {self.events:,} events each",
-            *prepared,
+            *([prepared] if self.walls else []),
             f"time: about {_clock(seconds)} with {self.workers} processes of one thread on as many free cores",
             f"disk: about {_size(self.objects * self.shard_bytes)}; {_size(free)} are free",
             f"memory: {'about ' if self.worker_bytes else ''}{memory}",
@@ -237,7 +236,8 @@ class Estimate:
 def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 1)) -> Estimate:
     """Simulate the middle object of a share twice, the first time to compile and to fill caches.
 
-    Where `vary` draws walls, it is simulated before a wall of another draw, too, to see what that one takes.
+    It is simulated before another wall, too, to see what that one takes: of another draw where `vary` draws
+    walls, else hardly further away, as each process renders the light path of the one wall for itself.
 
     Args:
         config: The settings.
@@ -249,17 +249,19 @@ def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 
     """
     names = config.glyphs.objects()[share[0] - 1 :: share[1]]
     if not names:
-        raise ConfigError(
-            f"share {share[0]}/{share[1]} of {len(config.glyphs.objects())} objects is empty; give fewer shares"
-        )
+        objects = len(config.glyphs.objects())
+        raise ConfigError(f"share {share[0]}/{share[1]} of {objects} objects is empty; give fewer shares")
     at_once = processes(workers, len(names))
     name = names[len(names) // 2]
     simulate_object(config, name)
-    walls = _walls(config, len(names), at_once)
-    fresh = 0.0
+    walls, held, away_m = _walls(config, len(names), at_once), 0, config.setup.default_distance_m
+    is_one, fresh, other = not walls and away_m is not None, 0.0, replace(config, seed=config.seed + 1)
+    if is_one:
+        other = replace(config, setup=config.setup.at_distance((away_m or 1.0) * (1 + 1e-6)))
+        walls, held = at_once, _peak_bytes()  # before there are two
     if walls:
         began = time.process_time()
-        simulate_object(replace(config, seed=config.seed + 1), name)
+        simulate_object(other, name)
         fresh = time.process_time() - began
         simulate_object(config, name)  # which the other wall may have pushed out of the caches
     began = time.process_time()
@@ -270,7 +272,8 @@ def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 
         size = path.stat().st_size
     spent = time.process_time() - began
     prepared = max(fresh - spent, 0.0) if walls else 0.0
-    return Estimate(len(names), spent, prepared, walls, size, _peak_bytes(), at_once, len(events))
+    walls = 0 if is_one and prepared < _LEAST_S else walls
+    return Estimate(len(names), spent, prepared, walls, size, held or _peak_bytes(), at_once, len(events))
 
 
 def _walls(config: Simulation, objects: int, workers: int) -> int:
@@ -368,15 +371,12 @@ def repair(
         DataError: The dataset holds captures (import them again), or its settings were changed by hand.
     """
     if dataset.origin != "simulation":
-        raise DataError(
-            f"{dataset.folder} holds captures; delete the {len(faults)} faulty shards and import again"
-        )
+        what = f"{dataset.folder} holds captures"
+        raise DataError(f"{what}; delete the {len(faults)} faulty shards and import again")
     config = from_dict(Simulation, dataset.config, source=str(dataset.folder / PAGE))
     if config_hash(dataset.config) != dataset.config_hash or is_page_changed(dataset):
-        raise DataError(
-            f"{dataset.folder / PAGE} was changed: its settings no longer fit their hash "
-            f"{dataset.config_hash}; restore it, or simulate into a new folder"
-        )
+        what = f"{dataset.folder / PAGE} was changed: its settings do not fit their hash {dataset.config_hash}"
+        raise DataError(f"{what}; restore it, or simulate into a new folder")
     with claim_dataset(dataset):
         for fault in faults:
             dataset.shard(fault.name).unlink(missing_ok=True)

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
@@ -20,7 +21,7 @@ from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, rea
 from evnlos.data.sampling import Samples, Sampling
 from evnlos.errors import DataError, UnknownNameError
 from evnlos.events.files.container_write import Storage
-from evnlos.files import directory_lock, is_empty, new_file
+from evnlos.files import LOCK, directory_lock, is_empty, new_file
 from evnlos.machine import undisturbed
 from evnlos.registry import __version__
 from evnlos.types import Events
@@ -165,11 +166,7 @@ def read_shard_index(path: str | Path) -> ShardIndex:
 
 @contextmanager
 def _damage(path: str | Path) -> Iterator[None]:
-    """Turn what HDF5 says of a file that is missing or damaged into one line.
-
-    Raises:
-        DataError: The file is missing or damaged.
-    """
+    """Turn what HDF5 says of a file that is missing or damaged into one line, a `DataError`."""
     try:
         yield
     except FileNotFoundError:
@@ -182,11 +179,7 @@ def _damage(path: str | Path) -> Iterator[None]:
 def _array(
     file: h5py.File, name: str, axes: int, steps: slice | NDArray[np.int64] | None = None
 ) -> NDArray | None:
-    """Return a dataset's values at some time steps, or None where the file has none of that name.
-
-    Raises:
-        ValueError: The values lie outside the file, are no numbers, or are more than the file can hold.
-    """
+    """Return a dataset's values at some time steps, None where there is none; `ValueError` of odd ones."""
     node = stored(file, name)
     if node is None:
         return None
@@ -208,8 +201,8 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-PAGE = "dataset.yaml"
-"""Name of the file that describes a dataset, in its folder."""
+PAGE, CHECKS = "dataset.yaml", "checks"
+"""Names, in a dataset's folder, of the file that describes it and of the folder of pictures of its captures."""
 _DIGEST = "digest"
 
 
@@ -305,7 +298,6 @@ def create_dataset(dataset: Dataset, settings: type[Any] | None = None) -> Datas
     """
     if check_dataset(dataset, settings):
         return replace(dataset, config_hash=open_dataset(dataset.folder).config_hash)
-    dataset.folder.mkdir(parents=True, exist_ok=True)
     content = _content(dataset)
     save_yaml(content | {_DIGEST: config_hash(content)}, dataset.folder / PAGE)
     return dataset
@@ -313,7 +305,7 @@ def create_dataset(dataset: Dataset, settings: type[Any] | None = None) -> Datas
 
 @contextmanager
 def claim_dataset(dataset: Dataset, part: str = "", settings: type[Any] | None = None) -> Iterator[Dataset]:
-    """Hold a dataset's folder for this process, and create the dataset there or take it up.
+    """Hold a dataset's folder, and create the dataset there or take it up; an error before any shard undoes it.
 
     Args:
         dataset: What is to be there.
@@ -326,8 +318,16 @@ def claim_dataset(dataset: Dataset, part: str = "", settings: type[Any] | None =
     Raises:
         DataError: As `check_dataset`, and then the folder stays as it is; or another process holds it.
     """
+    page, checks = dataset.folder / PAGE, dataset.folder / CHECKS
     with directory_lock(dataset.folder, part, check=lambda: check_dataset(dataset, settings)):
-        yield create_dataset(dataset, settings)
+        is_new = not (part or page.is_file())
+        try:
+            yield create_dataset(dataset, settings)
+        except Exception:
+            if is_new and not {*dataset.folder.glob("*")} - {dataset.folder / LOCK, page, checks}:
+                page.unlink(missing_ok=True)
+                shutil.rmtree(checks, ignore_errors=True)
+            raise
 
 
 def open_dataset(folder: str | Path) -> Dataset:

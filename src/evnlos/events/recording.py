@@ -370,6 +370,8 @@ class EventWindows:
         transform: Callable[[Any], Any] | None = None,
         **options: Any,
     ) -> None:
+        if not isinstance(events, Events):
+            raise DataError(f"{events!r:.80} is no stream of events; give evnlos.read_events(FILE)")
         self.events, self.window_us, self.stride_us = events, window_us, stride_us or window_us
         if not len(events) or window_us <= 0 or self.stride_us <= 0:
             raise DataError(

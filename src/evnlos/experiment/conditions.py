@@ -206,7 +206,6 @@ def sweep_parameters(
             alone.
         progress: Called when the work begins and of a condition and when it is done.
     """
-    out.mkdir(parents=True, exist_ok=True)
     keys = [config_hash({"condition": to_dict(one), "characters": characters}) for one in chosen]
     paths = [out / f"{key}.json" for key in keys]
     todo = [k for k, path in enumerate(paths) if not path.is_file()]

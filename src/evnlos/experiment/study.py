@@ -331,7 +331,6 @@ def is_scored(blank: Record, there: dict[str, Record]) -> bool:
 def write_record(record: Record, folder: Path) -> Path:
     """Write a record as `folder`/NAME.json and return the path."""
     path = folder / f"{record.name}.json"
-    folder.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps(to_dict(record), indent=1).encode())
     return path
 

@@ -368,7 +368,6 @@ def bounds_table(setup: Path, capture: Path, name: str) -> str:
 
 def write_generalization(found: list[GeneralizationResult], path: Path) -> None:
     """Write the findings, sequence by sequence, as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps([to_dict(one) for one in found], indent=1).encode())
 
 

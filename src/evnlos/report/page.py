@@ -172,7 +172,6 @@ def write_report(
         The path of the page.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     words, metrics = Glossary(), available_metrics(results)
     content = "\n".join(
         [

@@ -584,6 +584,5 @@ def _save(path: Path, light: NDArray[np.float32], over: NDArray[np.bool_]) -> No
     """Write an image of 16 bits, saturated where the film was."""
     numbers = np.clip(np.rint(light * 65_535), 0, _CODED).astype(np.uint16)
     numbers[over] = 65_535
-    path.parent.mkdir(parents=True, exist_ok=True)
     with new_file(path) as draft:
         Image.fromarray(numbers).save(draft, "PNG")
