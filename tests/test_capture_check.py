@@ -367,7 +367,7 @@ def steady(tmp_path_factory):
     return read_capture(render_captures(STEADY, tmp_path_factory.mktemp("steady"))[0])
 
 
-@pytest.mark.parametrize(("shift_us", "way"), [(350_000, "late"), (-350_000, "early"), (3_000_000, "late")])
+@pytest.mark.parametrize(("shift_us", "way"), [(400_000, "late"), (-400_000, "early"), (3_000_000, "late")])
 def test_frames_on_a_shifted_clock_are_found_with_the_cure(steady, shift_us, way) -> None:
     found = {one.what: one for one in check_capture(steady)}["clock offset"]
     assert found.level == "good" and found.cure == ""

@@ -318,13 +318,13 @@ def clock_offset(capture: Capture) -> Iterator[Finding]:
     if capture.info.dark is None:
         blink = f"a black level of the frames makes some of it: give a dark frame (dark); {blink}"
     way, told = "late" if lag.lag_us < 0 else "early", abs(lag.lag_us) > lag.unsure_us + _ALONE_US
+    usual, most = (1e-6 * one for one in (lag.limit_us, lag.unsure_us + _ALONE_US))
     finding = _finding(
         "clock offset",
         abs(lag.lag_us) <= lag.limit_us,
         not told,
         f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
-        f"{lag.limit_us * 1e-6:.2f} s is usual, up to {(lag.unsure_us + _ALONE_US) * 1e-6:.2f} s cannot be told from what "
-        "pixels do by themselves)",
+        f"{usual:.2f} s is usual, up to {most:.2f} s cannot be told from what pixels do by themselves)",
         _offset_cure(capture.info, lag.lag_us) if told else f"to be sure, {blink}",
     )
     yield replace(finding, lag_us=lag.lag_us)
