@@ -177,7 +177,7 @@ def test_a_page_on_recordings_that_nobody_can_have_says_how_to_make_their_like()
     cites -= {DOCS / name for name in ("lab.md", "live.md")}  # that page itself; captures one records
     assert len(cites) >= 7
     for path in cites:
-        assert "lab.md#published-captures" in pages[path], path
+        assert re.search("lab.md#(published-captures|the-main-experiment-on-them)", pages[path]), path
 
 
 def test_no_page_to_start_with_asks_for_a_compiler() -> None:
@@ -207,6 +207,25 @@ def test_the_readme_has_the_scores_of_the_records() -> None:
             seeds = np.mean(scores, axis=1)
             assert seeds.mean() == pytest.approx(mean, abs=0.006), (row, modality)
             assert seeds.std(ddof=1) == pytest.approx(spread, abs=0.006), (row, modality)
+
+
+@pytest.mark.parametrize("name", ["near"])
+def test_the_page_of_published_captures_has_the_scores_of_the_records(name: str) -> None:
+    page = (DOCS / "lab.md").read_text(encoding="utf-8").partition(f"| `{name}`: G, K, 4, 9")[2]
+    records = ROOT / "benchmarks" / "results" / "experiments" / "published"
+    arms = (
+        "E2E, single positions",
+        "E2E, single positions, averaged",
+        "simulation only sequence",
+        "EPNP sequence",
+    )
+    for row in arms:
+        line = page.partition(f"| {row} |")[2].partition("\n")[0]
+        arm = row.lower().replace(",", "").replace(" ", "-")
+        for told, modality in zip(line.split("|")[:3], ("frame", "event", "fusion"), strict=True):
+            file = records / f"{name}-test-{arm}-{modality}-seed0.json"
+            scores = json.loads(file.read_text())["scores"]["psnr_db"].values()
+            assert np.mean(list(scores)) == pytest.approx(float(told), abs=0.006), (row, modality)
 
 
 def test_the_figure_of_rooms_shows_the_table_of_its_page() -> None:
