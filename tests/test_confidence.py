@@ -424,7 +424,7 @@ def test_each_verdict_says_what_is_guessed() -> None:
     assert verdict_on(None, replace(sure, explained=None)).guessed == GUESSED[None]
     assert verdict_on(None, None, "no confidence: why").lines[0] == "no confidence: why"
     wrong = replace(sure, explained=0.3)
-    assert "70 % are required" in wrong.verdict and "distance and wall" in wrong.verdict
+    assert "70 % are required" in wrong.verdict and "distance, light and wall" in wrong.verdict
 
 
 def test_captures_of_the_known_light_stay_and_those_of_another_wall_are_refused(shared_data) -> None:

@@ -68,10 +68,9 @@ class Reconstruction:
 
 _LEVELS = tuple(round(0.75 ** (k / 2), 3) for k in range(-8, 9) if abs(k) > 1)
 """Brightnesses, 0.32 to 3.2 of the known one, that are tried where the frames are poorly explained."""
-_POOR, _FINE, _BETTER = 0.97, 0.9, 0.02
-"""The share of the frames that images of the known brightness must explain for no other to be tried, what those
-of another must explain, and how much more: before another wall than the model's, some brightness always fits
-better."""
+_POOR, _FINE, _BETTER, _ALIKE = 0.99, 0.9, 0.5, 1.1
+"""Share of the frames that images of the known brightness explain for no other to be tried; that of another,
+and what it may leave of what these leave; times the least that is left, up to which brightnesses are alike."""
 
 
 def _in_known_light(
@@ -99,15 +98,17 @@ def _in_known_light(
         return samples, images, None
     ambient = operator.ambient.unflatten(0, operator.size)
     still = (frames - light_gain(images, frames, operator) * (operator(images) - ambient)).mean(dim=0)
-    best = max(_FINE, own + _BETTER), samples, images, None
+    tried = dict[float, tuple[float, Samples, Tensor]]()
     for level in _LEVELS:
         note(f"light {level:g} x the known")
         seen = replace(samples, frame=(ambient + (frames - still) / level).float().numpy())
         drawn = reconstruct(weights, seen.frame, seen.surface, at)
-        share = share_explained(drawn, frames, at, mean, operator, canvas)
-        if share > best[0]:
-            best = share, seen, drawn, level
-    return best[1:]
+        tried[level] = share_explained(drawn, frames, at, mean, operator, canvas), seen, drawn
+    least = 1 - max(share for share, _, _ in tried.values())
+    alike = [level for level, (share, _, _) in tried.items() if 1 - share <= _ALIKE * least]
+    share, seen, drawn = tried[level := alike[len(alike) // 2]]
+    is_other = share > _FINE and 1 - share < _BETTER * (1 - own)
+    return (seen, drawn, level) if is_other else (samples, images, None)
 
 
 _KNOW_LATER = ("trace", "likelihood", "corrected")
@@ -160,12 +161,11 @@ class Model:
                 sequences is not told the motion.
         """
         tracked = setup_for_track(setup) if track else None
-        eyes = self.weights.modality
+        weights, eyes = self.weights, self.weights.modality
         if not isinstance(recording, Capture):
             recording = read_capture(recording, needs_frames=False, needs_events=False)
         capture = recording
         capture.info.check_cameras(capture.name, frames=eyes.needs_frames, events=eyes.needs_events)
-        weights = self.weights
         if so_far:
             shown = weights.network.seeing(replace(weights.sampling, surface="so-far"))
             weights = replace(weights, network=_causal(shown, "leave --so-far away, or take other weights"))

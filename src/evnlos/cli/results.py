@@ -117,6 +117,10 @@ def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool) -> N
         return
     first = f"{out / 'result.png'}: {capture.name} by {found['weights']}, published"
     print("\n".join([first, *found["in_words"]]))
+    if not found.get("confidence", {}).get("measured", True):
+        print(
+            "these weights know another wall or light; the demo now calibrates and trains for the captures' own"
+        )
 
 
 @dataclass(frozen=True)
