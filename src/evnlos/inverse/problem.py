@@ -2,6 +2,7 @@
 
 - The weight of a prior by leaving out blocks of the wall: no truth, and no belief in independent errors.
 - Several targets at once.
+- Our operators as physics of deepinv, so that its solvers and networks run on them.
 """
 
 from __future__ import annotations
