@@ -233,7 +233,7 @@ def test_without_weights_published_ones_that_fit_are_taken(tiny_captures, tmp_pa
         text = (copy / "capture.yaml").read_text()
         (copy / "capture.yaml").write_text(text.replace("  mask: target.png\n", ""))
     text = (unknown / "capture.yaml").read_text()
-    (unknown / "capture.yaml").write_text(text[: text.index("motion:")] + "setup:\n  distance_m: unknown\n")
+    (unknown / "capture.yaml").write_text(text[: text.index("motion:")] + "setup:\n  distance_m: null\n")
     taken = []
     for number, capture in enumerate((folder, unknown)):
         capsys.readouterr()

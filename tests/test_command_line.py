@@ -242,8 +242,8 @@ def test_where_a_result_goes_is_looked_at_before_it_is_worked_for(
         (["track", "CAPTURE"], "track.json"),
         (["invert", "wall.npz", "--out", "wall.png"], "wall.npz"),
         (["report", "run", "--data", "d"], "report.csv"),
-        (["events", "a.gif", "--out", "a.h5"], "a.h5"),
-        (["events", "a.gif", "--out", "a.h5", "--preview", "a.gif"], "a.gif"),
+        (["events", "VIDEO", "--out", "a.h5"], "a.h5"),
+        (["events", "VIDEO", "--out", "a.h5", "--preview", "a.gif"], "a.gif"),
         (["convert", "a.raw", "--out", "a.csv"], "a.csv"),
         (["clean", "a.raw", "--out", "a.csv"], "a.csv"),
         (["preview", "a.raw"], "a.gif"),
@@ -265,8 +265,10 @@ def test_nothing_is_replaced_without_force(words, there, tiny_captures, tmp_path
     monkeypatch.chdir(tmp_path)
     Path(there).parent.mkdir(exist_ok=True)
     Path(there).write_text("precious")
+    tmp_path.with_suffix(".gif").write_bytes(b"GIF89a")
     with pytest.raises(SystemExit) as end:
-        main([str(tiny_captures[0]) if word == "CAPTURE" else word for word in words])
+        known = {"CAPTURE": tiny_captures[0], "VIDEO": tmp_path.with_suffix(".gif")}
+        main([str(known.get(word, word)) for word in words])
     told = capsys.readouterr().err
     assert end.value.code == 2 and told.count("\n") == 1 and f"{there} exists; give another" in told
     assert "--force" in told and Path(there).read_text() == "precious"

@@ -218,7 +218,7 @@ def test_what_is_no_video_is_refused_in_one_sentence(tmp_path: Path, monkeypatch
     picture = Image.fromarray(np.zeros((4, 6), np.uint8))
     picture.save(tmp_path / "one.png")
     refuses(tmp_path / "absent.mp4", "no such file")
-    refuses(tmp_path / "*.gif", "no file fits")
+    refuses(tmp_path / "*.gif", "matches nothing")
     refuses(tmp_path / "one.png", "1 frame;")
     refuses([tmp_path / "one.png", tmp_path / "two.png"], "two.png: no such file", fps=1)
     refuses([], "no video")
