@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,9 +21,7 @@ from torch import Tensor
 from evnlos.cameras import CrossingLaw, PixelSettings
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data import NlosDataset, Samples
-from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
-from evnlos.events import event_histogram
 from evnlos.models import (
     Confidence,
     ConfidenceReport,
@@ -174,11 +171,11 @@ class EventChanges:
         """
         if (law := pixel.crossing_law()) is None:
             return None
-        changes = []
-        for start, stop in pairwise(times_us.tolist()):
-            on, off = event_histogram(events, [start, stop])[0]
-            changes.append(reduce_by_area(law.threshold_on * on - law.threshold_off * off, size))
-        return cls(torch.from_numpy(np.stack(changes)).double(), law)
+        from evnlos.tracking.event_motion import event_counts, log_changes
+
+        pixels = events.height * events.width / (size[0] * size[1])  # of the sensor, a sample pixel
+        change = log_changes(event_counts(events, np.asarray(times_us * 1e-6, np.float64), size), law) / pixels
+        return cls(torch.from_numpy(change).unflatten(1, size), law)
 
     def made(self, frames: Tensor) -> Tensor:
         """Return the changes of the log light of frames [N, h, w], white levels, [N - 1, h, w]."""
@@ -285,12 +282,9 @@ def confidence_of(
     seen = weights.modality.inputs(samples.frame, samples.surface)
     frames = torch.from_numpy(samples.frame)
     sequence = (seen, frames, images, samples.position_m)
-    known, canvas = weights.confidence, weights.sampling.canvas
-    if operator is None or changes is None:
-        return _report_of(weights.network, known, *sequence, canvas, operator)
-    share = share_held(images, changes, samples.position_m, known.mean, operator, canvas)
-    halves = halves_of(weights.network, seen, samples.position_m, canvas)
-    return known.judge(images, halves, share, "events")
+    return _report_of(
+        weights.network, weights.confidence, *sequence, weights.sampling.canvas, operator, changes
+    )
 
 
 def why_no_confidence(weights: Weights, samples: Samples) -> str | None:
@@ -320,11 +314,14 @@ def _report_of(
     position_m: NDArray,
     canvas: Plane,
     operator: FrameOperator | None,
+    changes: EventChanges | None = None,
 ) -> ConfidenceReport:
-    share = None
-    if operator is not None and bool(frames.any()):
+    share, judge = None, "frames" if changes is None else "events"
+    if operator is not None and changes is not None:
+        share = share_held(images, changes, position_m, confidence.mean, operator, canvas)
+    elif operator is not None and bool(frames.any()):
         share = share_explained(images, frames, position_m, confidence.mean, operator, canvas)
-    return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
+    return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share, judge)
 
 
 def confidence_values(report: ConfidenceReport) -> dict[str, Any]:

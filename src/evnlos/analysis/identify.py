@@ -147,8 +147,12 @@ class Identification:
     @property
     def wall(self) -> str:
         """What the wall allows, in one sentence that does not hang on the grid of the analysis."""
-        told = _frames(self.settings.frames)
-        return f"from {told} of this wall, {self.verdict.partition(': ')[2].removesuffix('.')}"
+        return self.allowed("this wall")
+
+    def allowed(self, which: str) -> str:
+        """Return what the wall allows, as `wall`, with a name for it: `which`."""
+        told = self.verdict.partition(": ")[2].removesuffix(".")
+        return f"from {_frames(self.settings.frames)} of {which}, {told}"
 
     def summary(self, arrays: bool = False) -> dict[str, Any]:
         """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
@@ -299,10 +303,10 @@ def verdict_on(
         is_stated: Whether the setup is that of the recording by somebody's word; else it is that of the
             weights, and where nothing was measured it says nothing of this wall.
     """
-    known = setup is not None and setup.is_linear and (is_stated or report is None or report.measured)
+    wall, which = "", "this wall" if is_stated else "the wall that these weights know"
     try:
-        wall = identify(setup, replace(QUICK, frames=frames)).wall if known and setup is not None else ""
-        wall = wall if is_stated else wall.replace(" of this wall", " of the wall that these weights know", 1)
+        if setup is not None and setup.is_linear and (is_stated or report is None or report.measured):
+            wall = identify(setup, replace(QUICK, frames=frames)).allowed(which)
     except MissingDependencyError as error:  # of handwriting; the images stand without the answer
         wall = f"what the wall allows is not known: {error}"
     if report is None:

@@ -195,7 +195,7 @@ class Model:
             images = weights.network.infer(inputs, seen.position_m, so_far=True)
             return Reconstruction(images, samples, warnings=warnings, no_confidence=_SO_FAR, brought_from=level)
         changes, times = None, capture.frame_times_us[-len(samples) :]
-        if operator is not None and judge is not None and "frame" not in eyes.slices:
+        if operator is not None and judge is not None and unjudged is None and "frame" not in eyes.slices:
             changes = EventChanges.of(capture.events, times, judge.pixel, operator.size)
         confidence = confidence_of(weights, seen, images, operator, changes)
         found = Reconstruction(

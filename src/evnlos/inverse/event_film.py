@@ -209,7 +209,6 @@ def estimate_event_film(
         prior = frames.film.prior
     found = prior or FilmPrior(_DEVIATION, _RESTING, side * _LENGTH, side * _SPEED)
     values, basis = film_modes(relative.T @ relative, plane, found.length_m)
-    flat = np.asarray(np.linalg.solve(basis, np.full(len(basis), _BRIGHT)), np.float64)
     modes = min(_MODES, _MOST // len(times), len(values))
     if modes < min(_FEWEST, len(values)):
         raise DataError(
@@ -218,19 +217,20 @@ def estimate_event_film(
     kept = np.argsort(values)[::-1][:modes]
     hidden = np.square(np.delete(basis, kept, axis=1)).sum(axis=1)
     count, cells, shape = len(times), basis[:, kept], (dark.shape[0], dark.shape[1])
-    middle = np.tile(flat[kept], count)
-    begun = np.full((count, len(basis)), _BRIGHT)
+    inverse = np.asarray(np.linalg.inv(basis)[kept], np.float64)  # [K, C]: from cells to modes
+    flat = np.full((count, len(basis)), _BRIGHT)
+    middle, begun = (flat @ inverse.T).ravel(), flat
     if frames is not None:
         alone = frames.film.mean.reshape(len(frames.film.times_s), -1)
         begun = _on_line(frames.film.times_s, alone, times)
-    w = np.asarray((begun @ np.linalg.inv(basis).T)[:, kept], np.float64).ravel()
+    w = (begun @ inverse.T).ravel()
     rest = begun - w.reshape(count, -1) @ cells.T  # the modes left out
     light = FilmLight.of(matrix @ cells, ambient[:, None] + matrix @ rest.T, times, shape)
     own = _precision(found, times, wave_numbers(cells, plane))
     known = None if frames is None else _of_frames(frames, cells, rest, times)
     trust, annealed = np.ones(len(record)), max(settings.iterations - _SETTLED, 1)
     factor = np.empty((0, 0)), True
-    turns = range(settings.iterations)
+    turns, spread = range(settings.iterations), found.deviation * math.hypot(1.0, found.resting)
     for turn in counted(turns, progress, "estimate the film", len(turns), "turns"):
         share = min(turn / annealed, 1.0)
         least = settings.first_noise ** (1 - share) * settings.least_noise**share
@@ -243,12 +243,11 @@ def estimate_event_film(
             total.score += known.score - known.information @ w
         factor = cho_factor(total.information + own, lower=True, overwrite_a=True)
         step = cho_solve(factor, total.score - own @ (w - middle))
-        spread = found.deviation * math.hypot(1.0, found.resting)
         w = w + step * min(1.0, _STEP * spread / max(float(np.abs(step).max()), 1e-12))
     covariance = cho_solve(factor, np.eye(len(w)))
     blocks = covariance.reshape(count, modes, count, modes)[np.arange(count), :, np.arange(count)]
     variance = np.einsum("ck,tkl,cl->tc", cells, blocks, cells, optimize=True)
-    variance += (found.deviation**2 * (1 + found.resting**2)) * hidden
+    variance += spread**2 * hidden
     images = (w.reshape(count, modes) @ cells.T + rest).reshape(-1, *plane.shape)
     deviation = np.sqrt(np.maximum(variance, 0.0)).reshape(-1, *plane.shape)
     static = 0.0 if frames is None else frames.film.static

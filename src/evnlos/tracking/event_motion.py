@@ -245,7 +245,7 @@ def fit_motion_to_events(
     return times, fit.as_motion(path, covariance)
 
 
-def _said(counts: Array, law: CrossingLaw) -> Array:
+def log_changes(counts: Array, law: CrossingLaw) -> Array:
     """Return how the log light changes by the thresholds that events [M, 2, P] passed, [M, P]."""
     return law.threshold_on * counts[:, 0] - law.threshold_off * counts[:, 1]
 
@@ -265,7 +265,7 @@ def _first_path(
     """
     from scipy.ndimage import gaussian_filter  # scipy loads slowly
 
-    change = _said(counts, law)
+    change = log_changes(counts, law)
     level = np.concatenate([np.zeros((1, change.shape[1])), np.cumsum(change, axis=0)])
     level = gaussian_filter(level.reshape(-1, *shape), (0, _BLUR_PX, _BLUR_PX))
     light = reduce_by_area(ambient, shape) * np.expm1(
@@ -396,7 +396,7 @@ class EventFit:
         bright = light(np.append(path.z, np.zeros(len(covariance) - known)))[:, at]
         made = np.diff(np.log(np.maximum(bright, _DARK)), axis=1).T.reshape(-1, *self._shape)
         made = reduce_by_area(made, shape).reshape(len(counts), -1)
-        said = _said(counts, law)
+        said = log_changes(counts, law)
         share = float((said * made).sum()) ** 2 / max(float((said**2).sum() * (made**2).sum()), 1e-300)
         free = len(covariance) - float(np.diag(covariance)[:known].sum())  # the prior decides the rest
         return share, free / said.size
