@@ -23,6 +23,7 @@ from evnlos.cli import main
 from evnlos.cli.main import command_of
 from evnlos.config import save_yaml
 from evnlos.data import Dataset, Samples, Sampling, Simulation, create_dataset, write_shard
+from evnlos.demo import Demo, run_demo
 from evnlos.plot.setup import PARTITION, setup_drawing
 from evnlos.report import RunResult, seen_in_training, write_report
 from evnlos.report.pictures import curves_svg
@@ -259,6 +260,27 @@ def _parsed(line: str, monkeypatch: pytest.MonkeyPatch):
     main([verb, *rest])
     assert program == "evnlos" and len(parsed) == 1 and not any(word in ("", ".") for word in rest)
     return parsed[0]
+
+
+def test_the_page_of_the_demo_says_what_renders_its_captures_again(tmp_path, monkeypatch) -> None:
+    """Its work is left out: what matters are the notes that the page gets."""
+    notes, folder = list[str](), tmp_path / "lab_A"
+    folder.mkdir()
+    (folder / "capture.yaml").write_text("camera: {width: 8, height: 4}\n")
+    for name, made in {
+        "data.lab.render_captures": [folder],
+        "experiment.run_study": None,
+        "experiment.read_records": [],
+        "experiment.gain_table": "",
+        "report.collect_results": (None, []),
+        "report.to_text": "",
+    }.items():
+        monkeypatch.setattr(f"evnlos.{name}", lambda *_, made=made, **__: made)
+    monkeypatch.setattr("evnlos.report.write_report", lambda *given, **_: notes.extend(given[3]))
+    demo = Demo(tmp_path / "demo", test=("A",), calibrate=False, seed=7)
+    run_demo(demo)
+    (command,) = [one.partition("again by: ")[2] for one in notes if "evnlos lab" in one]
+    assert _parsed(command, monkeypatch).settings == demo.lab
 
 
 def test_weights_are_called_by_run_file_or_published_name(tmp_path, monkeypatch) -> None:

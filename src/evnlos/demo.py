@@ -135,22 +135,22 @@ def run_demo(settings: Demo) -> Path:
     """
     from evnlos.data.lab import render_captures
     from evnlos.experiment import Place, gain_table, read_records, run_study
-    from evnlos.report import collect_results, to_text, write_report
+    from evnlos.report import collect_results, lab_command, to_text, write_report
     from evnlos.setups import named_setup
 
     if settings.scene:
         return run_scene(settings.scene, settings.out / settings.scene)
     began, out = time.perf_counter(), settings.out
-    captures = captures_in(settings.captures)
+    folders = captures_in(settings.captures)
     place = Place((), out, settings.workers, trainings=settings.workers, force=settings.force)
     out.mkdir(parents=True, exist_ok=True)
     notes = []
-    folders = captures
     if not folders:
         lab = settings.lab
         notes += [
             "Synthetic captures: a rough aluminium wall and cameras were rendered. The simulator does not know "
             "their parameters and has to estimate them by calibration.",
+            f"They are rendered again by: {lab_command(lab)}",
             *lab.glyphs.notes(),
         ]
         with ProgressBars() as progress:

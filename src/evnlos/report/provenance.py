@@ -24,6 +24,7 @@ import yaml
 
 from evnlos.config import read_yaml
 from evnlos.data import Capture, Dataset, Sampling, read_capture
+from evnlos.data.lab import Lab
 from evnlos.data.sampling import SOLVED
 from evnlos.errors import DataError, printable
 from evnlos.machine import Progress, Step, silent
@@ -295,6 +296,21 @@ def _score_line(scores: dict[str, Any]) -> str:
         return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
     except (KeyError, TypeError, ValueError, AttributeError):
         return "  its scores are not what this version writes"
+
+
+def lab_command(lab: Lab) -> str:
+    """Return what renders a laboratory's captures again, in the folder `captures`.
+
+    Args:
+        lab: A laboratory of which only characters and seed differ from the usual one.
+
+    Example:
+        >>> from evnlos.data.lab import Lab
+        >>> lab_command(Lab(seed=3)).partition("--glyphs")[0]
+        'evnlos lab --out captures --seed 3 '
+    """
+    words = ["evnlos", "lab", "--out", "captures", "--seed", str(lab.seed)]
+    return shlex.join([*words, "--glyphs.characters", lab.glyphs.characters])
 
 
 PUBLISHED = Path(__file__).parents[1] / "data" / "published_captures.yaml"
