@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
@@ -184,17 +186,36 @@ def test_a_sheet_holds_every_position_and_asks_nobody(app_sequence, app_weights)
         assert len(view.captions) in (0, 40)
 
 
+def built_page(gradio: Any, scratch: Path) -> Any:
+    """Return the page, without networks and not served."""
+
+    async def build() -> Any:  # in a loop, or Gradio makes one and leaves it open
+        return build_page(gradio, ("", ""), Controls(), Networks({}), scratch, 10_000)
+
+    return asyncio.run(build())
+
+
 def test_a_number_beside_a_slider_keeps_to_its_ends(tmp_path) -> None:
     gradio = pytest.importorskip("gradio")
-
-    async def build() -> object:  # in a loop, or Gradio makes one and leaves it open
-        return build_page(gradio, ("", ""), Controls(), Networks({}), tmp_path, 10_000)
-
-    page = asyncio.run(build())
+    page = built_page(gradio, tmp_path)
     sliders = [one for one in page.blocks.values() if isinstance(one, gradio.Slider)]
     assert len(sliders) > 5
     for one in sliders:
         assert one.preprocess(1e6) == one.maximum and one.preprocess(-1e6) == one.minimum
+
+
+def test_the_page_leaves_out_what_comes_of_a_removed_upload(tmp_path, monkeypatch) -> None:
+    gradio = pytest.importorskip("gradio")
+    monkeypatch.setattr("evnlos.app.page.uploaded", lambda path, *_: (f"sheet of {path}", "message"))
+    page, visitor = built_page(gradio, tmp_path), SimpleNamespace(session_hash="one")
+    (file,) = [one for one in page.blocks.values() if isinstance(one, gradio.File)]
+    begin, read = [one.fn for one in page.fns.values() if file in one.inputs]
+    begin("a.raw", visitor)
+    assert read("a.raw", visitor) == ("sheet of a.raw", "message")
+    for then in (None, "b.raw"):
+        assert begin(then, visitor)[0] == ""
+        assert "sheet" not in str(read("a.raw", visitor))
+    assert read("b.raw", visitor)[0] == "sheet of b.raw"
 
 
 def test_what_comes_of_a_removed_upload_is_not_shown() -> None:
