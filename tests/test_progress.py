@@ -92,7 +92,7 @@ def test_lines_of_json_hold_numbers_for_a_program(capsys) -> None:
         assert one["left_s"] == pytest.approx(one["elapsed_s"] * 2.5 / 1.5, abs=0.2)
 
 
-@pytest.mark.parametrize(("how", "variable"), [("none", ""), (None, "1"), ("lines", "1")])
+@pytest.mark.parametrize(("how", "variable"), [("none", ""), (None, "1"), ("bar", "1"), ("lines", "1")])
 def test_quiet_and_tqdm_disable_show_nothing(how, variable, capsys, monkeypatch) -> None:
     monkeypatch.setenv("TQDM_DISABLE", variable)
     work(how)
