@@ -154,7 +154,7 @@ def test_a_dry_run_counts_the_walls_that_are_drawn(tmp_path, monkeypatch) -> Non
 
     def simulated(config: Simulation, name: str):
         wall = drawn_for(config, name).setup
-        spent[0] += 1 if wall in seen else 20
+        spent[0] += 1 if wall in seen else 80
         seen.add(wall)
         return samples, events
 
@@ -167,13 +167,14 @@ def test_a_dry_run_counts_the_walls_that_are_drawn(tmp_path, monkeypatch) -> Non
     monkeypatch.setattr("evnlos.data.simulations.time.process_time", lambda: spent[0])
     found = estimate(config, workers=3)
     objects = len(config.glyphs.objects())
-    assert (found.cpu_s, found.preparation_s, found.walls) == (1, 19, 6)
+    assert (found.cpu_s, found.preparation_s, found.walls) == (1, 79, 6)
     lines = found.lines(tmp_path)
-    assert "walls: 6 to prepare, 19.00 s of CPU each" in lines
-    assert f"time: about {(objects + 6 * 19) / 180:.0f} min with 3 processes" in " ".join(lines)
+    assert "walls: 6 to prepare, 79.00 s of CPU each" in lines
+    minutes, without = (f"time: about {(objects + n * 79) / 180:.0f} min with 3 processes" for n in (6, 0))
+    assert minutes in " ".join(lines) and minutes != without
     assert estimate(replace(config, setups=0), workers=3).walls == objects
     one = estimate(replace(config, vary={}), workers=3)  # whose light path each process renders
-    assert (one.cpu_s, one.preparation_s, one.walls) == (1, 19, 3)
+    assert (one.cpu_s, one.preparation_s, one.walls) == (1, 79, 3)
     assert estimate(replace(config, vary={}), workers=3).walls == 0  # rendered before: nothing to tell
 
 
