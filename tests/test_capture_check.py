@@ -378,6 +378,17 @@ def test_frames_on_a_shifted_clock_are_found_with_the_cure(steady, shift_us, way
     assert stated == pytest.approx(-shift_us, abs=200_000)
 
 
+def test_a_little_beyond_the_usual_is_no_alarm_and_names_no_offset(steady) -> None:
+    """Slow and noisy pixels are as far off with clocks that are one: the cure would set them apart."""
+    (usual,) = clock_offset(steady)
+    assert usual.lag_us is not None
+    limit_us = 1e6 / STEADY.frame_rate_hz / 2
+    shifted = replace(steady, frame_times_us=steady.frame_times_us + round(usual.lag_us + 1.2 * limit_us))
+    (found,) = clock_offset(shifted)
+    assert found.level == "doubtful" and "cannot be told from what pixels do" in found.found
+    assert "offset_us" not in found.cure
+
+
 @pytest.mark.parametrize(("off", "leak_hz", "rate_hz"), [(1.4, 0.0, 5.0), (1.4, 0.1, 5.0), (0.25, 0.1, 4.0)])
 def test_a_polarity_of_a_higher_threshold_is_no_clock_offset(tmp_path, off, leak_hz, rate_hz) -> None:
     pixel = replace(STEADY.setup.pixel, threshold_on=0.12, threshold_off=off, leak_rate_hz=leak_hz)
