@@ -140,6 +140,11 @@ def test_the_messages_of_the_questions_are_those_of_the_code() -> None:
     quoted = re.findall(r"^> (.*)$", (DOCS / "faq.md").read_text(), flags=re.MULTILINE)
     assert len(quoted) >= 15
     assert not [line for line in quoted if line not in known]
+    # What questions and answers quote of a message is a part of it; numbers stand for what it fills in.
+    page = " ".join((DOCS / "faq.md").read_text().split())
+    parts = [re.sub(r"[\d.]+ %", "...", one) for one in re.findall(r'"([^"]+)"', page) if len(one.split()) > 3]
+    assert len(parts) >= 2
+    assert not [one for one in parts if not any(one in text for text in known)]
 
 
 def test_files_that_pages_name_exist() -> None:
