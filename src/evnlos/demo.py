@@ -150,7 +150,7 @@ def run_demo(settings: Demo) -> Path:
         notes += [
             "Synthetic captures: a rough aluminium wall and cameras were rendered. The simulator does not know "
             "their parameters and has to estimate them by calibration.",
-            f"They are rendered again by: {lab_command(lab)}",
+            f"They are rendered again by: {lab_command(LAB_CHARACTERS, settings.seed)}",
             *lab.glyphs.notes(),
         ]
         with ProgressBars() as progress:

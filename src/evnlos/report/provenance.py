@@ -24,7 +24,6 @@ import yaml
 
 from evnlos.config import read_yaml
 from evnlos.data import Capture, Dataset, Sampling, read_capture
-from evnlos.data.lab import Lab
 from evnlos.data.sampling import SOLVED
 from evnlos.errors import DataError, printable
 from evnlos.machine import Progress, Step, silent
@@ -298,19 +297,19 @@ def _score_line(scores: dict[str, Any]) -> str:
         return "  its scores are not what this version writes"
 
 
-def lab_command(lab: Lab) -> str:
-    """Return what renders a laboratory's captures again, in the folder `captures`.
+def lab_command(characters: str, seed: int) -> str:
+    """Return what renders the usual laboratory's captures again, in the folder `captures`.
 
     Args:
-        lab: A laboratory of which only characters and seed differ from the usual one.
+        characters: What its targets show.
+        seed: Its seed.
 
     Example:
-        >>> from evnlos.data.lab import Lab
-        >>> lab_command(Lab(seed=3)).partition("--glyphs")[0]
-        'evnlos lab --out captures --seed 3 '
+        >>> lab_command("ALT", 3)
+        'evnlos lab --out captures --seed 3 --glyphs.characters ALT'
     """
-    words = ["evnlos", "lab", "--out", "captures", "--seed", str(lab.seed)]
-    return shlex.join([*words, "--glyphs.characters", lab.glyphs.characters])
+    words = ["evnlos", "lab", "--out", "captures", "--seed", str(seed), "--glyphs.characters", characters]
+    return shlex.join(words)
 
 
 PUBLISHED = Path(__file__).parents[1] / "data" / "published_captures.yaml"
