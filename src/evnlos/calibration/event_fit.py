@@ -92,13 +92,13 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     Raises:
         DataError: The light moves so little that no pixel tells a threshold.
     """
-    dead_time_s = shortest_interval_s([r.events for r in recordings])
+    dead_time_s, every = shortest_interval_s([r.events for r in recordings]), recordings
     recordings = [thinned(recording) for recording in recordings]
     regions = [regions_of(recording) for recording in recordings]
     observed = moments(recordings, regions, [r.events for r in recordings])
     first = replace(_first_guess(recordings, regions, observed, start), cutoff_hz=_CUTOFFS_HZ[5])
     pixel, _ = _match(recordings, regions, observed, first, seed, 6)
-    cutoff, allowed = _scan_cutoff(recordings, pixel, seed)
+    cutoff, allowed = _scan_cutoff(every, pixel, seed)
     pixel, values = _match(recordings, regions, observed, replace(pixel, cutoff_hz=cutoff), seed, 2)
     error = _errors(recordings, regions, pixel, values, seed)
     if pixel.leak_rate_hz < error["leak_rate_hz"]:
@@ -138,7 +138,7 @@ def choose_pixel(
         found = fit_model(told, name, known.pixel, seed=seed)
         pixel, cutoff = found.pixel, None
         if isinstance(pixel, EventPixel):
-            corner, cutoff = _scan_cutoff(few, pixel, seed)
+            corner, cutoff = _scan_cutoff(recordings, pixel, seed)
             pixel = replace(pixel, cutoff_hz=corner)
         after = misfit(judged, pixel, seed)
         compared[name] = float(after.sum())
@@ -238,6 +238,11 @@ def _scan_cutoff(
 
     A frequency is allowed where its misfit exceeds the best one's by no more than twice the standard error of
     that difference, from its scatter over the tenths of seconds.
+
+    Args:
+        recordings: Light and events of all pixels: those of a quarter leave a dim sensor's cutoff open.
+        pixel: Its other settings.
+        seed: Seed of the simulations.
     """
     misfit = []
     for cutoff in _CUTOFFS_HZ:
