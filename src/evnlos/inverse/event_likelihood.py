@@ -13,7 +13,9 @@ With z the coefficients of the Gaussian prior and L(i, t; z) the filtered log li
 - The leak is known to a few per cent and is estimated along; so are both mean thresholds where asked.
 - Frames are linear in z, with the camera's noise, and an unknown offset of each pixel of an unknown pattern.
 
-Gauss-Newton on it, the error of a crossing annealed from 0.25; the curvature is the estimate's information.
+Gauss-Newton on it, the error of a crossing annealed from 0.25, of events alone on some thousand pixels first,
+where more steps cost little: with few, some letters end where a wrong one explains them. The curvature is the
+estimate's information.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from numpy.typing import NDArray
 
 from evnlos.cameras import CrossingLaw
 from evnlos.errors import ConfigError
+from evnlos.events import stride_for
 from evnlos.inverse.event_record import EventRecord, Levels, levels_of
 from evnlos.inverse.prior import PatternPrior
 from evnlos.inverse.sequence_light import (
@@ -44,6 +47,8 @@ _FEWEST_NOISE = 0.01  # share of the events that no model explains
 _SMALLEST_NOISE = 3e-3  # that crossings are believed to have, log units
 _NEAR_NOISE = 0.05  # first error of a crossing where a start is given, log units
 _STEADY_S = 0.4  # errors of the level change in about this time
+_FIRST_PIXELS, _FIRST_RANK = 1000, 120  # about, and most factors of their light, of the estimate to start from
+_FIRST_ITERATIONS, _ANNEALED = 28, 12  # of it; in so many its error of a crossing shrinks to the least
 _ACTIVE = 1e-3  # weight of a silence, in that of a threshold just met, below which it is left out
 
 
@@ -64,7 +69,7 @@ class LikelihoodSettings:
     first_noise: float = 0.25
     """Error of a crossing in the first iteration, log units."""
     iterations: int = 12
-    """Iterations of Gauss and Newton."""
+    """Iterations of Gauss and Newton with all pixels; half of them from an estimate of few."""
     block: int = 16_384
     """Instants that are looked at together: what bounds the memory. The result does not depend on it."""
 
@@ -123,7 +128,7 @@ def estimate_sequence(
         record: The events, with silences (`record_of`, `gap_s`); None = frames alone.
         frames: The frames; None = events alone.
         settings: What is taken for granted; None is the default.
-        start: Coefficients to start from, [k]; None = the prior's mean, and the frames' where there are any.
+        start: Coefficients to start from, [k]; None = those of frames, or else of few pixels.
 
     Raises:
         ConfigError: Neither frames nor events, or events without their law.
@@ -141,19 +146,42 @@ def estimate_sequence(
         return _finished(
             prior, covariance @ frames.normal.score, covariance, np.zeros(_NUISANCES), math.nan, math.nan
         )
-    error = max(settings.threshold_error, _KNOWN)
-    known = np.concatenate([np.ones(count), np.full(2, error**-2), [settings.leak_error**-2]])
     unknown = np.zeros(count + _NUISANCES)
     if start is not None:
         unknown[:count] = start
     elif frames is not None:
         unknown[:count] = np.linalg.solve(own + frames.normal.information, frames.normal.score)
-    first = settings.first_noise if start is None else min(settings.first_noise, _NEAR_NOISE)
+    first, iterations = settings.first_noise, settings.iterations
+    if start is None and frames is None and (stride := stride_for(len(light.left), _FIRST_PIXELS)) > 1:
+        few, width = light.every(stride, _FIRST_RANK), light.shape[1]
+        _annealed(few, law, record.every(stride, width), None, unknown, settings, first, _FIRST_ITERATIONS)
+        first, iterations = _NEAR_NOISE, (iterations + 1) // 2
+    elif start is not None:
+        first = min(first, _NEAR_NOISE)
+    total, trust, noise = _annealed(light, law, record, frames, unknown, settings, first, iterations)
+    covariance = np.asarray(np.linalg.inv(total.information)[:count, :count], np.float64)
+    noisy = float(1.0 - trust[record.measured].mean()) if record.measured.any() else math.nan
+    return _finished(prior, unknown[:count], covariance, unknown[count:], noisy, noise)
+
+
+def _annealed(
+    light: SequenceLight,
+    law: CrossingLaw,
+    record: EventRecord,
+    frames: FrameTerm | None,
+    unknown: Array,
+    settings: LikelihoodSettings,
+    first: float,
+    iterations: int,
+) -> tuple[NormalEquations, Array, float]:
+    """Improve `unknown`, and return its equations, the probability of each instant, the error of a crossing."""
+    count = len(unknown) - _NUISANCES
+    error = max(settings.threshold_error, _KNOWN)
+    known = np.concatenate([np.ones(count), np.full(2, error**-2), [settings.leak_error**-2]])
     trust = np.ones(len(record))
     total, noise = NormalEquations.empty(len(unknown)), first
-    steps = max(settings.iterations - 3, 1)  # the last three have the final error
-    shares = np.minimum(np.arange(settings.iterations) / steps, 1.0)
-    for share in shares:
+    steps = max(min(iterations - 3, _ANNEALED), 1)  # the last ones have the final error
+    for share in np.minimum(np.arange(iterations) / steps, 1.0):
         least = first ** (1 - share) * settings.least_noise**share
         total = NormalEquations.empty(len(unknown))
         noise = _add_events(total, light, law, record, unknown, least, trust, settings.block)
@@ -163,10 +191,8 @@ def estimate_sequence(
         total.information += np.diag(known)
         total.score -= known * unknown
         step = np.linalg.solve(total.information, total.score)
-        unknown = unknown + step * min(1.0, _LONGEST_STEP / max(float(np.abs(step[:count]).max()), 1e-12))
-    covariance = np.asarray(np.linalg.inv(total.information)[:count, :count], np.float64)
-    noisy = float(1.0 - trust[record.measured].mean()) if record.measured.any() else math.nan
-    return _finished(prior, unknown[:count], covariance, unknown[count:], noisy, noise)
+        unknown += step * min(1.0, _LONGEST_STEP / max(float(np.abs(step[:count]).max()), 1e-12))
+    return total, trust, noise
 
 
 def _finished(

@@ -1,9 +1,9 @@
 """What all events of a sequence say of the target, in a second.
 
-The estimate of `event_likelihood`, in single precision: from every eighth row and column first, which need a
-sixty-fourth of the work, then a step from every fourth, one from every second, and a last one from all. Mean
-thresholds are those of the setup, and the filter counts as a delay 1 / w. What the last iteration leaves,
-information A and score b about the coefficients z of the prior, is all that the events say of the target there.
+The estimate of `event_likelihood`, in single precision: from every fourth row and column first (of a larger
+sensor every eighth), then a step from every second, and a last one from all. Mean thresholds are those of the
+setup, and the filter counts as a delay 1 / w. What the last iteration leaves, information A and score b about
+the coefficients z of the prior, is all that the events say of the target there.
 
 | symbol | meaning | unit |
 |---|---|---|
@@ -34,8 +34,8 @@ from evnlos.inverse.sequence_light import Array, SequenceLight, Single
 from evnlos.types import Events
 
 _FIRST_GRIDS = ((8, 80), (4, 120), (2, 200))  # stride of rows and columns, and most factors, before all pixels
-_FEWEST_PIXELS = 200  # of a grid
-_FIRST_STEPS, _ANNEALED = 14, 6  # at most, of the first; its errors of a crossing shrink to the least
+_FEWEST_PIXELS = 900  # of a grid: with a quarter of them some letters end where a wrong one explains them
+_FIRST_STEPS, _ANNEALED = 28, 12  # at most, of the first; its errors of a crossing shrink to the least
 _SETTLED = 0.2  # step of a coefficient, standard deviations of the prior, after which no other is made
 _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
 _FEWEST_NOISE, _SMALLEST_NOISE = 0.01, 3e-3  # as in `event_likelihood`

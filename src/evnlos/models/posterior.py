@@ -44,7 +44,6 @@ from evnlos.inverse import (
     FilmEstimate,
     FilmFrames,
     FrameTerm,
-    LikelihoodSettings,
     PatternPrior,
     SequenceEstimate,
     SequenceLight,
@@ -65,7 +64,6 @@ from evnlos.types import Colour, Plane
 SPREAD = 0.5
 """Standard deviation that inputs of the network are scaled by; of bright and dark cells in equal parts."""
 _FOLDER = "priors"
-_FEW_PIXELS = 24  # iterations that a quarter of the pixels needs: with 12, dim ones stop on their way
 _RATIO = 0.9  # of the noise after a step to that before it
 _FARTHEST, _NEAREST = 2.0, 0.05  # distance r at the first and at the last turns
 _TURNS, _AT_LAST = 24, 8  # turns on the way, and at the least distance
@@ -367,8 +365,7 @@ def estimate_target(
         if colour is not None:
             kept = own[record.pixel]
             record = replace(record.of_pixels(kept), pixel=(np.cumsum(own) - 1)[record.pixel[kept]])
-    more = None if colour is None else LikelihoodSettings(iterations=_FEW_PIXELS)
-    found = estimate_sequence(light, basis, law, record, frames, more)
+    found = estimate_sequence(light, basis, law, record, frames)
     image, deviation, error, drawn = found.image, found.deviation, found.expected_error, None
     low, high = image - _NORMAL_90 * deviation, image + _NORMAL_90 * deviation
     if prior is not None:
