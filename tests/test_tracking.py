@@ -729,7 +729,8 @@ def test_the_command_inverts_a_sequence(capture, tmp_path, capsys) -> None:
     db = {(row["solver"], row["positions"]): row["psnr_db"] for row in rows}
     assert db["tikhonov", 8] > db["tikhonov", 1]
     assert db["tikhonov", 8] > 14
-    assert set(np.load(tmp_path / "i.npz")) == {f"{folder.name}_tikhonov_{n}" for n in (1, 8)}
+    shown = {f"{folder.name}_truth", *(f"{folder.name}_tikhonov_{n}" for n in (1, 8))}
+    assert set(np.load(tmp_path / "i.npz")) == shown
     left = {row["positions"]: row["unexplained"] for row in rows}
     assert left[1] is None and 0 <= left[8] < 0.05  # one frame tells nothing of the setup
     main(

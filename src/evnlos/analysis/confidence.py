@@ -442,6 +442,12 @@ def shares_left(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
     return {row["capture"]: row["unexplained"] for row in told}
 
 
+def left_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the most that the setup leaves unexplained of a capture, in words; "" where nothing is told."""
+    left = shares_left(rows).values()
+    return f"{100 * max(left):.1f} % of the light unexplained beside the noise" if left else ""
+
+
 def sequence_doubts(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return why images are not to be believed, a line each."""
     return [

@@ -198,9 +198,9 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
-        from evnlos.analysis.confidence import levels_text, sequence_doubts, shares_left
+        from evnlos.analysis.confidence import left_text, levels_text, sequence_doubts
         from evnlos.cli import invert_captures as work
-        from evnlos.plot.results import draw_inversion
+        from evnlos.plot.results import draw_inversion, sequence_panels
 
         torch.set_num_threads(1)
         if self.changing is not None:
@@ -224,15 +224,13 @@ class InvertCommand:
             found, pictures = invert(self.files, options, progress)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
-        most = max(row["positions"] for row in found["rows"])
-        best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
-        panels = [(name, image if self.colours else image[None]) for name, image in best.items()]
-        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
+        verdict = left_text(found["rows"])
+        panels, side_m = sequence_panels(found["rows"], pictures)
+        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels, side_m, verdict))
         save_arrays(self.out, pictures)
         if told := levels_text(found["rows"]):
             say(told)
-        left = shares_left(found["rows"]).values()
-        told = f"{100 * max(left):.1f} % of the light unexplained beside the noise; " if left else ""
+        told = f"{verdict}; " if verdict else ""
         table = (
             f"{' '.join(found['captures'])}\n{work.sequence_table(found['rows'])}\n{told}{found['seconds']} s"
         )

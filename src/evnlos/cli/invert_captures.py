@@ -91,16 +91,14 @@ def invert_captures(
     pairs = zip(captures, whites, strict=True)
     light = torch.stack([object_light(one.frames[1:], white, setup, shape, pattern) for one, white in pairs])
     noise = torch.tensor([temporal_noise(one.numpy()) if len(one) > 2 else math.inf for one in light])
-    pictures: dict[str, torch.Tensor] = {}
-    rows: list[dict[str, Any]] = []
+    pictures, rows = dict[str, torch.Tensor](), list[dict[str, Any]]()
     groups = _by_motion(captures, options, setup, progress)
-    total = len(groups)
-    for done, (motion, members) in enumerate(counted(groups, progress, "invert", total, "motions")):
+    for done, (motion, members) in enumerate(counted(groups, progress, "invert", len(groups), "motions")):
         size = captures[members[0]].info.target_size_m
         if _is_tracked(captures[members[0]], options):
             size *= 1.25  # a tracked position is that of the light's middle, which need not be the target's
         target_plane = Plane(options.cells, options.cells, size / options.cells)
-        progress(Step("invert", done, total, "motions", within="light path of the setup"))
+        progress(Step("invert", done, len(groups), "motions", within="light path of the setup"))
         transport = matrix_of(setup.seen_by((height, width)).operator(strip_of(motion, target_plane), shape))
         gram = strip_gram_of(transport)
         for count in options.positions or (len(motion),):
@@ -114,17 +112,19 @@ def invert_captures(
                 if count > 2:
                     told = unexplained(free, problem.samples, images, noise[members]).tolist()
                     # Behind a mosaic neighbours share their noise, and where nothing moves there is no share.
-                    known = [captures[member].info.camera.mosaic is None for member in members]
+                    known = [captures[k].info.camera.mosaic is None for k in members]
                     shares = [a if ok and a < math.inf else None for a, ok in zip(told, known, strict=True)]
                 for solver in options.solvers:
-                    progress(Step("invert", done, total, "motions", within=f"{solver}, {count} positions"))
+                    progress(Step("invert", done, len(groups), "motions", within=f"{solver}, {count} places"))
                     found = _solve(problem, images, solver, options.regularization[solver], free)
                     for member, image, share in zip(members, found, shares, strict=True):
-                        name = captures[member].name
+                        one, name = captures[member], captures[member].name
                         row = {"capture": name, "positions": count, "solver": solver, "unexplained": share}
-                        row["level"] = _level(captures[member], image, target_plane)
-                        rows.append({**row, "psnr_db": target_psnr(captures[member], image, size, motion)})
+                        row |= {"level": _level(one, image, target_plane), "side_m": size}
+                        rows.append({**row, "psnr_db": target_psnr(one, image, size, motion)})
                         pictures[f"{name}_{solver}_{count}"] = image
+                        if one.target is not None and options.colour is None:
+                            pictures[f"{name} truth"] = torch.from_numpy(one.target.rasterise(target_plane))
     figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
     return {**figures, "seconds": round(time.perf_counter() - clock, 1)}, pictures
 

@@ -307,7 +307,7 @@ class IdentifyCommand:
         """Identify and print."""
         from evnlos.analysis.bounds import sequence_bounds
         from evnlos.analysis.identify import identify, setup_table
-        from evnlos.plot.results import draw_identification, draw_setups
+        from evnlos.plot.setup import draw_identification, draw_setups
         from evnlos.setups import ROOMS, named_setup, setup_names
 
         names = [*self.setups, *self.setup, *(setup_names() if self.all else [])]

@@ -6,11 +6,11 @@
 - The path of a hidden object and its speed; needs matplotlib.
 - Can the confidence be trusted? What is left when the least supported sequences go, and support against skill.
 - A fitted event pixel: what was recorded beside what its model makes.
-- What a setup can show, drawn: singular values, Picard plot, modes, and the best linear image.
 """
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from evnlos.calibration import SetupFit
 from evnlos.files import write_atomically
 from evnlos.plot.figures import new_figure, save_figure, signed_map
+from evnlos.plot.setup import SCALES_M
 from evnlos.scene import Scene
 from evnlos.setups.files import Measurement
 from evnlos.tracking import Track
@@ -30,7 +31,6 @@ from evnlos.untrusted import open_image
 
 if TYPE_CHECKING:
     from evnlos.analysis.confidence import ConfidenceCheck
-    from evnlos.analysis.identify import Identification
     from evnlos.calibration.pixel_report import KnownLightFit
 
 
@@ -107,7 +107,12 @@ def draw_pixel_fit(fit: KnownLightFit, path: str | Path) -> None:
     save_figure(figure, path, dpi=100)
 
 
-def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]]) -> Path:
+def draw_inversion(
+    path: str | Path,
+    panels: Sequence[tuple[str, torch.Tensor]],
+    side_m: float | None = None,
+    verdict: str = "",
+) -> Path:
     """Draw images [channels, h, w] in a row under their titles.
 
     Each is drawn from 0 to its own 99.5th percentile: how bright the screen was is not known.
@@ -115,6 +120,8 @@ def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]])
     Args:
         path: The image, PNG or SVG.
         panels: Titles and images, one or three channels.
+        side_m: Width of the images, metres, for a scale bar; None draws none.
+        verdict: How far to believe them, below.
 
     Returns:
         The path.
@@ -122,12 +129,48 @@ def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]])
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    figure = new_figure((3.1 * len(panels), 3.0))
+    figure = new_figure((3.1 * len(panels), 3.4 if verdict else 3.0))
     for axes, (title, image) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         axes.imshow(as_image(image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
+        if side_m is not None:
+            _draw_scale(axes, image.shape[-2:], side_m)
+    if verdict:
+        figure.supxlabel(textwrap.fill(verdict, 42 * len(panels)), fontsize=9)
     return save_figure(figure, path, dpi=100)
+
+
+def sequence_panels(
+    rows: Sequence[dict[str, Any]], pictures: Mapping[str, torch.Tensor]
+) -> tuple[list[tuple[str, torch.Tensor]], float]:
+    """Return titles and images of inverted captures at most positions, truths first, and their width, metres.
+
+    Args:
+        rows: Figures of each capture, solver and number of positions.
+        pictures: Images by CAPTURE_SOLVER_POSITIONS, and of truths by "CAPTURE truth".
+    """
+    panels, most = list[tuple[str, torch.Tensor]](), max(row["positions"] for row in rows)
+    last = {(row["capture"], row["solver"]): row for row in rows if row["positions"] == most}
+    for (name, solver), row in last.items():
+        if (truth := pictures.get(f"{name} truth")) is not None and f"{name}, truth" not in dict(panels):
+            panels.append((f"{name}, truth", truth[None]))
+        known = "" if row["psnr_db"] is None else f", {row['psnr_db']:.1f} dB"
+        image = pictures[f"{name}_{solver}_{most}"]
+        panels.append((f"{name}, {solver}{known}", image.view(-1, *image.shape[-2:])))
+    return panels, max(row["side_m"] for row in rows)
+
+
+def _draw_scale(axes: Any, shape: Sequence[int], side_m: float) -> None:
+    """Draw a bar of about a quarter of the width below an image, and its length."""
+    length = max(one for one in SCALES_M if one <= max(side_m / 3, SCALES_M[0]))
+    height, width = shape
+    axes.plot(
+        [-0.5, length / side_m * width - 0.5], [1.04 * height - 0.5] * 2, color="0.2", lw=2, clip_on=False
+    )
+    words = f"{100 * length:g} cm" if length < 1 else f"{length:g} m"
+    axes.text(length / side_m * width, 1.04 * height - 0.5, f" {words}", va="center", fontsize=8)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(1.08 * height - 0.5, -0.5))
 
 
 def as_image(image: torch.Tensor) -> NDArray[np.float64]:
@@ -309,92 +352,3 @@ def draw_confidence(found: Mapping[str, Sequence[ConfidenceCheck]], path: str | 
     cloud.set(xlim=(-0.03, 1.03), ylim=(_LEAST_SKILL - 0.1, 1.05))
     cloud.legend(frameon=False, fontsize=7, loc="lower right")
     return save_figure(figure, path, dpi=100)
-
-
-def draw_identification(found: Identification, path: str | Path) -> Path:
-    """Draw singular values, the Picard plot of a typical target, the first modes, truth and linear image.
-
-    Args:
-        found: What `identify` returned.
-        path: The image, PNG or SVG.
-
-    Returns:
-        The path.
-
-    Raises:
-        MissingDependencyError: Matplotlib is not installed.
-    """
-    figure = new_figure((10.5, 6.2))
-    grid = figure.add_gridspec(2, 1, height_ratios=(1.5, 1))
-    curves, pictures = grid[0].subgridspec(1, 2), grid[1].subgridspec(2, 6)
-    _singular_values(figure.add_subplot(curves[0]), [found])
-    _picard(figure.add_subplot(curves[1]), found)
-    at = found.at_camera
-    for row, (image, title) in enumerate(((found.truth, "truth"), (at.picture, "best linear"))):
-        _image_of(figure.add_subplot(pictures[row, 0]), image, title)
-    for k, mode in enumerate(at.modes):
-        place = figure.add_subplot(pictures[k // 4, 1 + k % 4])
-        _image_of(place, mode, f"mode {k + 1}", signed_map(), float(mode.abs().max()))
-    words = figure.add_subplot(pictures[:, 5])
-    words.set_axis_off()
-    strokes = " x ".join("none" if w is None else f"{1e3 * w:.1f}" for w in at.stroke_m)
-    words.text(
-        0.0,
-        0.5,
-        f"{found.modes} modes > 1e-2\n{at.patterns} patterns > noise\nbars {strokes} mm\n"
-        f"linear {at.psnr_db:.1f} dB\nmean {found.mean_db:.1f} dB\nblack {found.zero_db:.1f} dB\n"
-        "modes: light > 0 > dark",
-        va="center",
-        fontsize=9,
-    )
-    figure.suptitle(found.name)
-    return save_figure(figure, path, dpi=100)
-
-
-def draw_setups(found: Sequence[Identification], path: str | Path) -> Path:
-    """Draw the singular values of several setups in one plot.
-
-    Args:
-        found: The setups.
-        path: The image, PNG or SVG.
-
-    Raises:
-        MissingDependencyError: Matplotlib is not installed.
-    """
-    figure = new_figure((8.0, 4.6))
-    _singular_values(figure.add_subplot(), found)
-    return save_figure(figure, path, dpi=100)
-
-
-def _singular_values(axes: Any, found: Sequence[Identification]) -> None:
-    walls = list(dict.fromkeys(one.name.partition("-")[0] for one in found))
-    for one in found:
-        values = one.singular.numpy()
-        wall, _, place = one.name.partition("-")
-        style = {"color": f"C{walls.index(wall)}", "linestyle": "--" if place == "far" else "-", "lw": 1.2}
-        axes.semilogy(np.arange(1, len(values) + 1), _above(values, 1e-7), label=one.name, **style)
-    axes.axhline(1e-2, color="k", lw=0.7, ls=":")
-    axes.set(xlabel="mode", ylabel="singular value / largest", ylim=(1e-7, 1.5), xscale="log")
-    axes.legend(frameon=False, fontsize=8, ncols=2 if len(found) > 6 else 1)
-
-
-def _picard(axes: Any, found: Identification) -> None:
-    at = found.at_camera
-    mode = np.arange(1, len(at.spectrum) + 1)
-    axes.semilogy(mode, _above(at.spectrum.numpy(), 1e-3), label="singular value / noise", lw=1.2)
-    axes.semilogy(mode, _above(at.picard.numpy(), 1e-3), ".", ms=3, label="a letter's coefficient / noise")
-    axes.axhline(1.0, color="k", lw=0.7, ls=":", label="noise")
-    axes.set(xlabel="mode", xscale="log", ylim=(1e-3, None))
-    axes.legend(frameon=False, fontsize=8)
-
-
-def _above(values: Any, floor: float) -> Any:
-    """Return the values with NaN, which is not drawn, below a floor."""
-    return np.where(values > floor, values, np.nan)
-
-
-def _image_of(axes: Any, image: Any, title: str, cmap: Any = "gray", largest: float | None = None) -> None:
-    low, high = (0.0, 1.0) if largest is None else (-largest, largest)
-    axes.imshow(image.numpy(), cmap=cmap, vmin=low, vmax=high)
-    axes.set_title(title, fontsize=8)
-    axes.set_axis_off()

@@ -1,6 +1,7 @@
-"""The setup to scale, and what a corner shows.
+"""The setup to scale, what it can show, and what a corner shows.
 
 - A setup, to scale, seen from above; SVG in the colours of the page that it stands on.
+- What a setup can show, drawn: singular values, Picard plot, modes, and the best linear image.
 - What a corner shows: the hidden side over bearing and time, and who moves there.
 """
 
@@ -8,9 +9,10 @@ from __future__ import annotations
 
 import html
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +21,7 @@ from evnlos.plot.figures import new_figure, save_figure, signed_map
 from evnlos.setups import Setup
 
 if TYPE_CHECKING:
+    from evnlos.analysis.identify import Identification
     from evnlos.inverse import CornerImage, FloorSector
     from evnlos.tracking import BearingTracks
 
@@ -26,7 +29,8 @@ _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
 _LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # distinguished with every common kind of colour blindness
 PARTITION = "hides the object (sketch)"
 """What stands beside the line that no setup's settings state."""
-_STEPS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+SCALES_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Lengths of scale bars."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +172,7 @@ def _svg(parts: list, around: NDArray[np.float64], wall: str, deep: float) -> st
     x, top, bottom = place((low[0], 0.0))[0] + 12, place((0.0, 0.0))[1] + 4, place((0.0, deep))[1]
     drawn.append(f"<path d='M{x:.1f} {top:.1f}V{bottom:.1f}' stroke='currentColor' stroke-width='.8' />")
     drawn.append(_text(x + 5, (top + bottom) / 2, f"{100 * deep:.3g} cm", "start"))
-    step = max((one for one in _STEPS_M if one * scale <= 150), default=_STEPS_M[0])
+    step = max((one for one in SCALES_M if one * scale <= 150), default=SCALES_M[0])
     left, foot = _MARGIN, _HEIGHT - 14
     drawn.append(f"<path d='M{left} {foot - 4}v4h{step * scale:.1f}v-4' fill='none' stroke='currentColor' />")
     drawn.append(_text(left + step * scale + 8, foot, f"{100 * step:g} cm; seen from above, to scale", "start"))
@@ -258,3 +262,92 @@ def draw_corner(
     below.set_title("what each adds to the floor" if found.tracks else "nobody is seen", fontsize=9)
     figure.suptitle("\n".join(textwrap.wrap(sentence, 130)), fontsize=10)
     return save_figure(figure, path, dpi=100)
+
+
+def draw_identification(found: Identification, path: str | Path) -> Path:
+    """Draw singular values, the Picard plot of a typical target, the first modes, truth and linear image.
+
+    Args:
+        found: What `identify` returned.
+        path: The image, PNG or SVG.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingDependencyError: Matplotlib is not installed.
+    """
+    figure = new_figure((10.5, 6.2))
+    grid = figure.add_gridspec(2, 1, height_ratios=(1.5, 1))
+    curves, pictures = grid[0].subgridspec(1, 2), grid[1].subgridspec(2, 6)
+    _singular_values(figure.add_subplot(curves[0]), [found])
+    _picard(figure.add_subplot(curves[1]), found)
+    at = found.at_camera
+    for row, (image, title) in enumerate(((found.truth, "truth"), (at.picture, "best linear"))):
+        _image_of(figure.add_subplot(pictures[row, 0]), image, title)
+    for k, mode in enumerate(at.modes):
+        place = figure.add_subplot(pictures[k // 4, 1 + k % 4])
+        _image_of(place, mode, f"mode {k + 1}", signed_map(), float(mode.abs().max()))
+    words = figure.add_subplot(pictures[:, 5])
+    words.set_axis_off()
+    strokes = " x ".join("none" if w is None else f"{1e3 * w:.1f}" for w in at.stroke_m)
+    words.text(
+        0.0,
+        0.5,
+        f"{found.modes} modes > 1e-2\n{at.patterns} patterns > noise\nbars {strokes} mm\n"
+        f"linear {at.psnr_db:.1f} dB\nmean {found.mean_db:.1f} dB\nblack {found.zero_db:.1f} dB\n"
+        "modes: light > 0 > dark",
+        va="center",
+        fontsize=9,
+    )
+    figure.suptitle(found.name)
+    return save_figure(figure, path, dpi=100)
+
+
+def draw_setups(found: Sequence[Identification], path: str | Path) -> Path:
+    """Draw the singular values of several setups in one plot.
+
+    Args:
+        found: The setups.
+        path: The image, PNG or SVG.
+
+    Raises:
+        MissingDependencyError: Matplotlib is not installed.
+    """
+    figure = new_figure((8.0, 4.6))
+    _singular_values(figure.add_subplot(), found)
+    return save_figure(figure, path, dpi=100)
+
+
+def _singular_values(axes: Any, found: Sequence[Identification]) -> None:
+    walls = list(dict.fromkeys(one.name.partition("-")[0] for one in found))
+    for one in found:
+        values = one.singular.numpy()
+        wall, _, place = one.name.partition("-")
+        style = {"color": f"C{walls.index(wall)}", "linestyle": "--" if place == "far" else "-", "lw": 1.2}
+        axes.semilogy(np.arange(1, len(values) + 1), _above(values, 1e-7), label=one.name, **style)
+    axes.axhline(1e-2, color="k", lw=0.7, ls=":")
+    axes.set(xlabel="mode", ylabel="singular value / largest", ylim=(1e-7, 1.5), xscale="log")
+    axes.legend(frameon=False, fontsize=8, ncols=2 if len(found) > 6 else 1)
+
+
+def _picard(axes: Any, found: Identification) -> None:
+    at = found.at_camera
+    mode = np.arange(1, len(at.spectrum) + 1)
+    axes.semilogy(mode, _above(at.spectrum.numpy(), 1e-3), label="singular value / noise", lw=1.2)
+    axes.semilogy(mode, _above(at.picard.numpy(), 1e-3), ".", ms=3, label="a letter's coefficient / noise")
+    axes.axhline(1.0, color="k", lw=0.7, ls=":", label="noise")
+    axes.set(xlabel="mode", xscale="log", ylim=(1e-3, None))
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _above(values: Any, floor: float) -> Any:
+    """Return the values with NaN, which is not drawn, below a floor."""
+    return np.where(values > floor, values, np.nan)
+
+
+def _image_of(axes: Any, image: Any, title: str, cmap: Any = "gray", largest: float | None = None) -> None:
+    low, high = (0.0, 1.0) if largest is None else (-largest, largest)
+    axes.imshow(image.numpy(), cmap=cmap, vmin=low, vmax=high)
+    axes.set_title(title, fontsize=8)
+    axes.set_axis_off()
