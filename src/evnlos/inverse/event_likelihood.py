@@ -69,7 +69,7 @@ class LikelihoodSettings:
     first_noise: float = 0.25
     """Error of a crossing in the first iteration, log units."""
     iterations: int = 12
-    """Iterations of Gauss and Newton with all pixels; half of them from an estimate of few."""
+    """Iterations of Gauss and Newton with all pixels; a third of them from an estimate of few."""
     block: int = 16_384
     """Instants that are looked at together: what bounds the memory. The result does not depend on it."""
 
@@ -155,7 +155,7 @@ def estimate_sequence(
     if start is None and frames is None and (stride := stride_for(len(light.left), _FIRST_PIXELS)) > 1:
         few, width = light.every(stride, _FIRST_RANK), light.shape[1]
         _annealed(few, law, record.every(stride, width), None, unknown, settings, first, _FIRST_ITERATIONS)
-        first, iterations = _NEAR_NOISE, (iterations + 1) // 2
+        first, iterations = _NEAR_NOISE, (iterations + 2) // 3
     elif start is not None:
         first = min(first, _NEAR_NOISE)
     total, trust, noise = _annealed(light, law, record, frames, unknown, settings, first, iterations)
