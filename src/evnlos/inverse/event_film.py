@@ -232,8 +232,7 @@ def estimate_event_film(
     factor = np.empty((0, 0)), True
     turns, spread = range(settings.iterations), found.deviation * math.hypot(1.0, found.resting)
     for turn in counted(turns, progress, "estimate the film", len(turns), "turns"):
-        share = min(turn / annealed, 1.0)
-        least = settings.first_noise ** (1 - share) * settings.least_noise**share
+        least = float(settings.noise_in(turn, annealed))
         rows = rows_of(light, law, record, w, least, trust)
         total = film_equations(film_rows(light, record, rows), light, law.threshold_sigma)
         if known is None:

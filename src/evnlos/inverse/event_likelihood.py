@@ -21,8 +21,8 @@ estimate's information.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -48,7 +48,8 @@ _SMALLEST_NOISE = 3e-3  # that crossings are believed to have, log units
 _NEAR_NOISE = 0.05  # first error of a crossing where a start is given, log units
 _STEADY_S = 0.4  # errors of the level change in about this time
 _FIRST_PIXELS, _FIRST_RANK = 1000, 120  # about, and most factors of their light, of the estimate to start from
-_FIRST_ITERATIONS, _ANNEALED = 28, 12  # of it; in so many its error of a crossing shrinks to the least
+FIRST_STEPS, ANNEALED = 28, 12
+"""Steps of an estimate from few pixels, and in how many its error of a crossing shrinks to the least."""
 _ACTIVE = 1e-3  # weight of a silence, in that of a threshold just met, below which it is left out
 
 
@@ -81,6 +82,16 @@ class LikelihoodSettings:
                 raise ConfigError(f"LikelihoodSettings.{name} is {getattr(self, name)}; give a positive number")
         if self.iterations < 2:
             raise ConfigError(f"LikelihoodSettings.iterations is {self.iterations}; give 2 or more")
+
+    def noise_in(self, step: float | NDArray[np.int64], annealed: int) -> Any:
+        """Return the least error of a crossing in a step, log units: from `first_noise` down to `least_noise`.
+
+        Args:
+            step: Number of the step, or of several, from 0.
+            annealed: Steps in which it shrinks, each by the same factor.
+        """
+        share = np.minimum(np.asarray(step) / annealed, 1.0)
+        return self.first_noise ** (1 - share) * self.least_noise**share
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,14 +162,14 @@ def estimate_sequence(
         unknown[:count] = start
     elif frames is not None:
         unknown[:count] = np.linalg.solve(own + frames.normal.information, frames.normal.score)
-    first, iterations = settings.first_noise, settings.iterations
-    if start is None and frames is None and (stride := stride_for(len(light.left), _FIRST_PIXELS)) > 1:
-        few, width = light.every(stride, _FIRST_RANK), light.shape[1]
-        _annealed(few, law, record.every(stride, width), None, unknown, settings, first, _FIRST_ITERATIONS)
-        first, iterations = _NEAR_NOISE, (iterations + 2) // 3
-    elif start is not None:
-        first = min(first, _NEAR_NOISE)
-    total, trust, noise = _annealed(light, law, record, frames, unknown, settings, first, iterations)
+    near = replace(settings, first_noise=min(settings.first_noise, _NEAR_NOISE))
+    if start is not None:
+        settings = near
+    elif frames is None and (stride := stride_for(len(light.left), _FIRST_PIXELS)) > 1:
+        few, those = light.every(stride, _FIRST_RANK), record.every(stride, light.shape[1])
+        _annealed(few, law, those, None, unknown, replace(settings, iterations=FIRST_STEPS))
+        settings = replace(near, iterations=max((settings.iterations + 2) // 3, 2))
+    total, trust, noise = _annealed(light, law, record, frames, unknown, settings)
     covariance = np.asarray(np.linalg.inv(total.information)[:count, :count], np.float64)
     noisy = float(1.0 - trust[record.measured].mean()) if record.measured.any() else math.nan
     return _finished(prior, unknown[:count], covariance, unknown[count:], noisy, noise)
@@ -171,18 +182,16 @@ def _annealed(
     frames: FrameTerm | None,
     unknown: Array,
     settings: LikelihoodSettings,
-    first: float,
-    iterations: int,
 ) -> tuple[NormalEquations, Array, float]:
     """Improve `unknown`, and return its equations, the probability of each instant, the error of a crossing."""
     count = len(unknown) - _NUISANCES
     error = max(settings.threshold_error, _KNOWN)
     known = np.concatenate([np.ones(count), np.full(2, error**-2), [settings.leak_error**-2]])
     trust = np.ones(len(record))
-    total, noise = NormalEquations.empty(len(unknown)), first
-    steps = max(min(iterations - 3, _ANNEALED), 1)  # the last ones have the final error
-    for share in np.minimum(np.arange(iterations) / steps, 1.0):
-        least = first ** (1 - share) * settings.least_noise**share
+    total, noise = NormalEquations.empty(len(unknown)), settings.first_noise
+    annealed = max(min(settings.iterations - 3, ANNEALED), 1)  # the last ones have the final error
+    for step in range(settings.iterations):
+        least = float(settings.noise_in(step, annealed))
         total = NormalEquations.empty(len(unknown))
         noise = _add_events(total, light, law, record, unknown, least, trust, settings.block)
         if frames is not None:
@@ -190,8 +199,8 @@ def _annealed(
             total.score[:count] += frames.normal.score - frames.normal.information @ unknown[:count]
         total.information += np.diag(known)
         total.score -= known * unknown
-        step = np.linalg.solve(total.information, total.score)
-        unknown += step * min(1.0, _LONGEST_STEP / max(float(np.abs(step[:count]).max()), 1e-12))
+        change = np.linalg.solve(total.information, total.score)
+        unknown += change * min(1.0, _LONGEST_STEP / max(float(np.abs(change[:count]).max()), 1e-12))
     return total, trust, noise
 
 

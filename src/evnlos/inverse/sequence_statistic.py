@@ -28,14 +28,13 @@ from numpy.typing import NDArray
 from evnlos.cameras import CrossingLaw
 from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
 from evnlos.cameras.streams import WHITE_DN
-from evnlos.inverse.event_likelihood import LikelihoodSettings, upward
+from evnlos.inverse.event_likelihood import ANNEALED, FIRST_STEPS, LikelihoodSettings, upward
 from evnlos.inverse.event_record import EventRecord, record_of
 from evnlos.inverse.sequence_light import Array, SequenceLight, Single
 from evnlos.types import Events
 
 _FIRST_GRIDS = ((8, 80), (4, 120), (2, 200))  # stride of rows and columns, and most factors, before all pixels
 _FEWEST_PIXELS = 900  # of a grid: with a quarter of them some letters end where a wrong one explains them
-_FIRST_STEPS, _ANNEALED = 28, 12  # at most, of the first; its errors of a crossing shrink to the least
 _SETTLED = 0.2  # step of a coefficient, standard deviations of the prior, after which no other is made
 _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
 _FEWEST_NOISE, _SMALLEST_NOISE = 0.01, 3e-3  # as in `event_likelihood`
@@ -194,9 +193,8 @@ class EventSolver:
 
     def _solved(self, events: Events, until_s: float, unknown: Array) -> EventStatistic:
         span = (float(self.light.times_s[0]), until_s)
-        record, last = record_of(events, self.law, span, self.settings.gap_s), self.settings.least_noise
-        shares = np.minimum(np.arange(_FIRST_STEPS) / _ANNEALED, 1.0)
-        noises = self.settings.first_noise ** (1 - shares) * last**shares
+        record = record_of(events, self.law, span, self.settings.gap_s)
+        noises = self.settings.noise_in(np.arange(FIRST_STEPS), ANNEALED)
         for stride, solver in self._coarse:
             solver.improve(record.every(stride, events.width), unknown, noises)
             noises = noises[-1:]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from evnlos.calibration import SetupFit
 from evnlos.files import write_atomically
 from evnlos.plot.figures import new_figure, save_figure, signed_map
-from evnlos.plot.setup import SCALES_M
+from evnlos.plot.setup import scale_bar
 from evnlos.scene import Scene
 from evnlos.setups.files import Measurement
 from evnlos.tracking import Track
@@ -143,8 +143,10 @@ def draw_inversion(
 
 def sequence_panels(
     rows: Sequence[dict[str, Any]], pictures: Mapping[str, torch.Tensor]
-) -> tuple[list[tuple[str, torch.Tensor]], float]:
-    """Return titles and images of inverted captures at most positions, truths first, and their width, metres.
+) -> tuple[list[tuple[str, torch.Tensor]], float | None]:
+    """Return titles and images of inverted captures at most positions, each after its truth, and their width.
+
+    The width is in metres, None where not all have one.
 
     Args:
         rows: Figures of each capture, solver and number of positions.
@@ -152,24 +154,24 @@ def sequence_panels(
     """
     panels, most = list[tuple[str, torch.Tensor]](), max(row["positions"] for row in rows)
     last = {(row["capture"], row["solver"]): row for row in rows if row["positions"] == most}
-    for (name, solver), row in last.items():
-        if (truth := pictures.get(f"{name} truth")) is not None and f"{name}, truth" not in dict(panels):
+    for name in dict.fromkeys(name for name, _ in last):
+        if (truth := pictures.get(f"{name} truth")) is not None:
             panels.append((f"{name}, truth", truth[None]))
-        known = "" if row["psnr_db"] is None else f", {row['psnr_db']:.1f} dB"
-        image = pictures[f"{name}_{solver}_{most}"]
-        panels.append((f"{name}, {solver}{known}", image.view(-1, *image.shape[-2:])))
-    return panels, max(row["side_m"] for row in rows)
+        for row in (row for (capture, _), row in last.items() if capture == name):
+            known = "" if row["psnr_db"] is None else f", {row['psnr_db']:.1f} dB"
+            image = pictures[f"{name}_{row['solver']}_{most}"]
+            panels.append((f"{name}, {row['solver']}{known}", image.view(-1, *image.shape[-2:])))
+    sides = {row["side_m"] for row in rows}
+    return panels, sides.pop() if len(sides) == 1 else None
 
 
 def _draw_scale(axes: Any, shape: Sequence[int], side_m: float) -> None:
-    """Draw a bar of about a quarter of the width below an image, and its length."""
-    length = max(one for one in SCALES_M if one <= max(side_m / 3, SCALES_M[0]))
-    height, width = shape
-    axes.plot(
-        [-0.5, length / side_m * width - 0.5], [1.04 * height - 0.5] * 2, color="0.2", lw=2, clip_on=False
-    )
-    words = f"{100 * length:g} cm" if length < 1 else f"{length:g} m"
-    axes.text(length / side_m * width, 1.04 * height - 0.5, f" {words}", va="center", fontsize=8)
+    """Draw a bar of at most a third of the width below an image, and its length."""
+    length, words = scale_bar(side_m / 3)
+    (height, width), foot = shape, 1.04 * shape[0] - 0.5
+    stop = length / side_m * width - 0.5
+    axes.plot([-0.5, stop], [foot, foot], color="0.2", lw=2, clip_on=False)
+    axes.text(stop + 0.5, foot, f" {words}", va="center", fontsize=8)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(1.08 * height - 0.5, -0.5))
 
 

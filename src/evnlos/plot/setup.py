@@ -29,8 +29,21 @@ _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
 _LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # distinguished with every common kind of colour blindness
 PARTITION = "hides the object (sketch)"
 """What stands beside the line that no setup's settings state."""
-SCALES_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Lengths of scale bars."""
+_SCALES_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+
+
+def scale_bar(most_m: float) -> tuple[float, str]:
+    """Return the length of a scale bar, metres, and the words for it: a round one.
+
+    Args:
+        most_m: Its length at most, from a centimetre on.
+
+    Example:
+        >>> scale_bar(0.03)
+        (0.02, '2 cm')
+    """
+    length = max((one for one in _SCALES_M if one <= most_m), default=_SCALES_M[0])
+    return length, f"{100 * length:g} cm"
 
 
 @dataclass(frozen=True)
@@ -172,10 +185,10 @@ def _svg(parts: list, around: NDArray[np.float64], wall: str, deep: float) -> st
     x, top, bottom = place((low[0], 0.0))[0] + 12, place((0.0, 0.0))[1] + 4, place((0.0, deep))[1]
     drawn.append(f"<path d='M{x:.1f} {top:.1f}V{bottom:.1f}' stroke='currentColor' stroke-width='.8' />")
     drawn.append(_text(x + 5, (top + bottom) / 2, f"{100 * deep:.3g} cm", "start"))
-    step = max((one for one in SCALES_M if one * scale <= 150), default=SCALES_M[0])
+    step, length = scale_bar(150 / scale)
     left, foot = _MARGIN, _HEIGHT - 14
     drawn.append(f"<path d='M{left} {foot - 4}v4h{step * scale:.1f}v-4' fill='none' stroke='currentColor' />")
-    drawn.append(_text(left + step * scale + 8, foot, f"{100 * step:g} cm; seen from above, to scale", "start"))
+    drawn.append(_text(left + step * scale + 8, foot, f"{length}; seen from above, to scale", "start"))
     return (
         f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {_WIDTH} {_HEIGHT}' width='{_WIDTH}' role='img' "
         f"aria-label='setup, to scale' font-family='sans-serif' font-size='12'>{''.join(drawn)}</svg>"

@@ -239,14 +239,15 @@ def fit_motion_to_events(
 
     with threadpool_limits(1):  # products are small: a second thread mostly waits
         path, covariance = fit.solved(start, record, law, events.width)
-    share, chance = fit.explained(path, covariance, counts, law, coarse)
-    if share < _BEYOND_CHANCE * chance:
-        raise DataError(
-            f"the path explains {100 * share:.2g} % of what the events say of the light, noise alone lets it "
-            f"explain {100 * chance:.2g} %: nothing to follow; light the target more, or lower the thresholds"
-        )
-    found = fit.as_motion(path, covariance)
-    return times, found if depth or turning else replace(found, target=fit.sharper(path, events, span_s))
+        share, chance = fit.explained(path, covariance, counts, law, coarse)
+        if share < _BEYOND_CHANCE * chance:
+            raise DataError(
+                f"the path explains {100 * share:.2g} % of what the events say of the light, noise alone lets "
+                f"it explain {100 * chance:.2g} %: nothing to follow; light the target more, or lower the "
+                "thresholds"
+            )
+        found = fit.as_motion(path, covariance)
+        return times, found if depth or turning else replace(found, target=fit.sharper(path, events, span_s))
 
 
 def log_changes(counts: Array, law: CrossingLaw) -> Array:
@@ -451,8 +452,7 @@ class EventFit:
     ) -> tuple[EventPath, Array, bool]:
         """Return the path after a Gauss-Newton step, all unknowns' covariance, and whether it was short."""
         count, (knots, kinds) = self.prior.count, (len(path.pose), len(self.kinds))
-        poses, share = slice(count, count + knots * kinds), min(number / _ANNEALED, 1.0)
-        least = self.settings.first_noise ** (1 - share) * self.settings.least_noise**share
+        poses, least = slice(count, count + knots * kinds), float(self.settings.noise_in(number, _ANNEALED))
         unknown = np.concatenate([path.z, np.zeros(knots * kinds + 1), [path.leak]])
         told = solver.improve(record, unknown, np.array([least]))
         known, score = np.zeros_like(told.information), told.score.copy()
