@@ -420,6 +420,8 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
         positions=8,
     )
     monkeypatch.setattr(simulations, "default", lambda: few)
+    told = list[str]()
+    monkeypatch.setattr(ProgressBars, "__call__", lambda _, step: told.append(step.what))
     one = ["--pretrain-epochs", 1, "--finetune-epochs", 1, "--e2e-epochs", 1, "--writers", 1, "--width", 8]
     one += ["--workers", 1, "--no-calibrate", "--single-epochs", 1, "--modalities", "event", "fusion"]
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
@@ -428,6 +430,10 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     assert "| sees | strongest E2E |" in shown and "was not fitted to this setup" in shown
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "Synthetic captures" not in page
+    parts = [re.fullmatch(r"part (\d) of 6, (.*)", what) for what in told]
+    numbers = [int(part[1]) for part in parts if part]
+    assert sorted(numbers) == numbers and {1, 2, 6} < set(numbers) and len(numbers) == len(told)
+    assert {part[2] for part in parts if part and part[1] == "6"} == {"evaluate"}
     # A second call takes up what is there: nothing is made again, the table is the same. The folder above the
     # captures, with a file beside them, stands for them; one without captures is refused.
     note = tiny_captures[0].parent / "note.txt"

@@ -76,6 +76,8 @@ def test_invert_draws_targets_that_the_frames_allow(tiny_captures, tmp_path, cap
     prior = LearnedPrior(AboutPrior(width=8, cells=32, trained_on="nothing"))
     save_prior(tmp_path / "priors" / "targets.safetensors", prior)
     monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
+    drawn = list[tuple]()
+    monkeypatch.setattr("evnlos.plot.results.draw_inversion", lambda *given: drawn.append(given[1:]))
     words = [
         "invert",
         str(tiny_captures[0]),
@@ -93,6 +95,11 @@ def test_invert_draws_targets_that_the_frames_allow(tiny_captures, tmp_path, cap
         samples = arrays[f"{name}_samples"]
         assert samples.shape == (3, 32, 32) and 0 <= samples.min() <= samples.max() <= 1
         np.testing.assert_allclose(arrays[name], samples.mean(axis=0), atol=1e-6)
+        assert set(np.unique(arrays[f"{name}_truth"])) >= {0.0, 1.0}
+    ((panels, side_m),) = drawn
+    titles = [f"{name} truth", f"{name}, {row['psnr_db']:.1f} dB of {row['expected_db']:.1f} expected"]
+    titles += [f"{name} deviation", *(f"{name} sample {k}" for k in (1, 2, 3))]
+    assert [title for title, _ in panels] == titles and side_m == row["side_m"] > 0
     main([*words, "--from", "frames", "--samples", "2"])
     assert "cells that the data leave open" in capsys.readouterr().out
     with pytest.raises(SystemExit):

@@ -5,9 +5,7 @@
 
 from __future__ import annotations
 
-import html
 import json
-import mimetypes
 import shlex
 import shutil
 import subprocess
@@ -22,7 +20,7 @@ from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_
 from evnlos.data.pool import workers_kept
 from evnlos.errors import CalibrationError, ConfigError, DataError, UnknownNameError
 from evnlos.files import write_atomically
-from evnlos.machine import ProgressBars
+from evnlos.machine import Progress, ProgressBars, Step
 from evnlos.types import OutFolder
 
 if TYPE_CHECKING:  # what runs is imported where it runs: help texts and wrong words need none of it
@@ -38,7 +36,8 @@ ROBUST = ", robust"
 
 _TEST = ("G", "K", "4", "9")
 _REPLACE = ("corner", "invert", "preview", "track")  # with --force they replace files
-_EMBEDDED_BYTES = 4_000_000  # larger images stay beside the page of a scene
+_PARTS = ("render", "calibrate", "import", "simulate", "draw", "train", "score", "evaluate")
+"""How the pieces of the main job begin, in their order."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +141,8 @@ def run_demo(settings: Demo) -> Path:
         return run_scene(settings.scene, settings.out / settings.scene)
     began, out = time.perf_counter(), settings.out
     folders = captures_in(settings.captures)
+    left_out = (*(("render",) if folders else ()), *(() if settings.calibrate else ("calibrate",)))
+    parts = [name for name in _PARTS if name not in left_out]
     place = Place((), out, settings.workers, trainings=settings.workers, force=settings.force)
     out.mkdir(parents=True, exist_ok=True)
     notes = []
@@ -153,9 +154,13 @@ def run_demo(settings: Demo) -> Path:
             f"They are rendered again by: {lab_command(LAB_CHARACTERS, settings.seed)}",
             *lab.glyphs.notes(),
         ]
-        with ProgressBars() as progress:
+        with ProgressBars() as bars:
             folders = render_captures(
-                lab, out / "captures", workers=settings.workers, progress=progress, force=settings.force
+                lab,
+                out / "captures",
+                workers=settings.workers,
+                progress=_numbered(bars, parts),
+                force=settings.force,
             )
     settings, lacking = _with_layers(settings)
     settings, alone = _with_cameras(settings, folders)
@@ -163,8 +168,8 @@ def run_demo(settings: Demo) -> Path:
     study = _study(settings, held_out(folders, settings.test), events=not alone)
     place = replace(place, captures=tuple(sorted(folders)))
     try:
-        with ProgressBars() as progress:
-            run_study(study, place, progress)
+        with ProgressBars() as bars:
+            run_study(study, place, _numbered(bars, parts))
     except CalibrationError as error:
         raise CalibrationError(
             f"{error}; or give --no-calibrate to go on with the default simulation"
@@ -179,7 +184,8 @@ def run_demo(settings: Demo) -> Path:
     notes += _of_corrections(single, out)
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
     recorded = [out / "recorded" / record.settings["captures"] for record in single]  # E2E sees other surfaces
-    with ProgressBars() as progress:
+    with ProgressBars() as bars:
+        progress = _numbered(bars, parts)
         dataset, results = collect_results(runs, recorded, workers=settings.workers, progress=progress)
     setup = named_setup(study.setup_folder(out)) if settings.calibrate else None
     path = write_report(out / "report.html", dataset, results, notes, setup=setup)
@@ -189,6 +195,18 @@ def run_demo(settings: Demo) -> Path:
     print(gain_table(records, f"EPNP{ROBUST if settings.robust else ''}"))
     print(f"report: {path} ({time.perf_counter() - began:.0f} s)")
     return path
+
+
+def _numbered(progress: Progress, parts: list[str]) -> Progress:
+    """Return progress that says in which part of the whole each piece of work is."""
+    at = 0
+
+    def numbered(step: Step) -> None:
+        nonlocal at
+        at = max([at, *(k for k, name in enumerate(parts, 1) if step.what.startswith(name))])
+        progress(replace(step, what=f"part {at} of {len(parts)}, {step.what}" if at else step.what))
+
+    return numbered
 
 
 def _with_layers(settings: Demo) -> tuple[Demo, list[str]]:
@@ -345,6 +363,8 @@ def run_scene(name: str, out: Path) -> Path:
         UnknownNameError: There is no such scene.
         DataError: A command failed; it has said why.
     """
+    from evnlos.report.page import scene_page
+
     scene, began = scene_of(name), time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)
     for file, content in scene.files.items():
@@ -367,34 +387,9 @@ def run_scene(name: str, out: Path) -> Path:
         done[step] = ran.stdout
         write_atomically(record, json.dumps(done, indent=1).encode())
     path = out / "index.html"
-    write_atomically(path, _scene_page(scene, out, done).encode())
+    what_is = {"What is right": scene.right, "What fails": scene.fails}
+    steps = [(step, done[step]) for step in scene.steps]
+    page = scene_page(scene.title, scene.shows, scene.pictures, what_is, steps, out)
+    write_atomically(path, page.encode())
     print(f"page: {path} ({time.perf_counter() - began:.0f} s)")
     return path
-
-
-def _scene_page(scene: HiddenScene, out: Path, said: dict[str, str]) -> str:
-    from evnlos.report.page import page_head
-    from evnlos.report.pictures import data_uri
-
-    figures = []
-    for file, caption in scene.pictures.items():
-        kind, where = mimetypes.guess_type(file)[0] or "image/png", out / file
-        if not where.is_file():  # the commands have said why, and go on
-            figures.append(f"<p>{html.escape(file)} is not there: images need evnlos[plot].</p>")
-            continue
-        is_small = where.stat().st_size <= _EMBEDDED_BYTES
-        source = data_uri(where.read_bytes(), kind) if is_small else html.escape(file)
-        image = f"<img class=moving src='{source}' alt='{html.escape(caption)}'>"
-        figures.append(f"<figure>{image}<figcaption>{html.escape(caption)}</figcaption></figure>")
-    steps = [f"<pre>$ {html.escape(step)}\n{html.escape(said[step])}</pre>" for step in scene.steps]
-    parts = [
-        page_head(scene.title),
-        f"<h1>{html.escape(scene.title)}</h1><p>{html.escape(scene.shows)}</p>",
-        f"<div class=movies>{''.join(figures)}</div>",
-        f"<p><b>What is right.</b> {html.escape(scene.right)}</p>",
-        f"<p><b>What fails.</b> {html.escape(scene.fails)}</p>",
-        "<h2>How</h2><p>Everything is simulated. These commands made it, in this folder:</p>",
-        *steps,
-        "</html>",
-    ]
-    return "\n".join(parts)

@@ -187,7 +187,7 @@ class ScanCommand:
 
     def _rehearse(self) -> None:
         from evnlos.calibration.scan import rehearse_film
-        from evnlos.cli.invert_captures import linear_setup
+        from evnlos.setups.load import linear_setup
 
         refuse_existing(self.force, self.folder / "film.mp4")
         with ProgressBars() as progress:

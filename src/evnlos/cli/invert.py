@@ -237,11 +237,12 @@ class InvertCommand:
         print(json.dumps(found) if self.json else table)
 
     def _film(self, word: Path, sides_m: tuple[float, float]) -> None:
-        from evnlos.cli.invert_captures import capture_of, linear_setup
+        from evnlos.cli.invert_captures import capture_of
         from evnlos.data import pattern_of
         from evnlos.models import estimate_film_of
         from evnlos.plot.results import draw_inversion
         from evnlos.report.pictures import grey, save_animation
+        from evnlos.setups.load import linear_setup
         from evnlos.types import Plane
 
         refuse_existing(self.force, film := self.out.with_suffix(".gif"))
@@ -287,7 +288,7 @@ class InvertCommand:
     def _estimate(self, setup: Path, evidence: Literal["frames", "events", "both"]) -> None:
         from evnlos.analysis.confidence import levels_text, sequence_doubts
         from evnlos.cli.invert_captures import estimate_captures, sequence_text
-        from evnlos.plot.results import draw_inversion
+        from evnlos.plot.results import draw_inversion, estimate_panels
 
         if self.positions or self.track or self.solver != "all":
             raise ConfigError("--from takes sequences of known motion; leave --positions, --track, --solver")
@@ -296,9 +297,8 @@ class InvertCommand:
             found, pictures = estimate_captures(self.files, setup, *how, progress, self.colours)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
-        sides = 2 + self.colours
-        panels = [(n, one.view(-1, *one.shape[-2:])) for n, one in pictures.items() if one.ndim == sides]
-        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
+        panels, side_m = estimate_panels(found["rows"], pictures)
+        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels, side_m))
         save_arrays(self.out, pictures)
         if told := levels_text(found["rows"]):
             say(told)

@@ -33,8 +33,8 @@ from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_g
 from evnlos.inverse.tikhonov import Rule
 from evnlos.machine import Progress, Step, counted, silent
 from evnlos.models import TargetEstimate, estimate_target, load_prior
-from evnlos.setups import Setup, load_setup
-from evnlos.setups.base import linear_kinds
+from evnlos.setups import Setup
+from evnlos.setups.load import linear_setup
 from evnlos.tracking import temporal_noise
 from evnlos.types import COLOURS, Colour, Plane
 
@@ -56,21 +56,6 @@ class SequenceOptions:
     colour: Colour | None = None
 
 
-def linear_setup(word: Path | str) -> Setup:
-    """Return the setup of a word (see `load_setup`), which has to be linear.
-
-    Raises:
-        ConfigError: It is of another kind, or there is none.
-    """
-    setup = load_setup(word)
-    if not setup.is_linear:
-        raise ConfigError(
-            f"{word} holds a setup of kind {setup.kind}, which is not linear; give one of kind "
-            f"{' or '.join(linear_kinds())}"
-        )
-    return setup
-
-
 def invert_captures(
     folders: Sequence[Path], options: SequenceOptions, progress: Progress = silent
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
@@ -79,8 +64,7 @@ def invert_captures(
     setup = linear_setup(options.setup)
     reads = counted(folders, progress, "read", len(folders), "captures")
     captures = [read_capture(one, needs_events=False, colour=options.colour) for one in reads]
-    # A pattern is that of grey frames.
-    pattern = pattern_of(options.setup, options.pattern) if options.colour is None else None
+    pattern = pattern_of(options.setup, options.pattern) if options.colour is None else None  # of grey frames
     height, width = captures[0].frames.shape[1:]
     if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
         raise ConfigError("the captures differ in number or size of their frames; invert them one by one")
@@ -124,7 +108,7 @@ def invert_captures(
                         rows.append({**row, "psnr_db": target_psnr(one, image, size, motion)})
                         pictures[f"{name}_{solver}_{count}"] = image
                         if one.target is not None and options.colour is None:
-                            pictures[f"{name} truth"] = torch.from_numpy(one.target.rasterise(target_plane))
+                            pictures[f"{name} truth"] = _truth(one, target_plane)
     figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
     return {**figures, "seconds": round(time.perf_counter() - clock, 1)}, pictures
 
@@ -133,10 +117,15 @@ def _level(capture: Capture, image: torch.Tensor, plane: Plane) -> float | None:
     """Return how bright an image is over the truth, by least squares; None where that is not known."""
     if capture.target is None:
         return None
-    truth = torch.from_numpy(capture.target.rasterise(plane)).to(image)
+    truth = _truth(capture, plane).to(image)
     if not truth.any():  # a colour that it does not have
         return None
     return round(float((image * truth).sum() / truth.square().sum().clamp(min=1e-12)), 3)
+
+
+def _truth(capture: Capture, plane: Plane) -> torch.Tensor:
+    assert capture.target is not None
+    return torch.from_numpy(capture.target.rasterise(plane))
 
 
 def invert_colours(
@@ -303,9 +292,11 @@ def estimate_captures(
         each = [estimate_target(one, setup, *how, colour) for colour, one in seen.items()]
         parts = [_row(*pair) for pair in zip(seen.values(), each, strict=True)]
         rows.append(_row_of_colours(parts) if colours else parts[0])
-        for title, part in ((name := parts[0]["capture"], "image"), (f"{name} deviation", "deviation")):
-            images = [torch.from_numpy(getattr(one, part)) for one in each]
-            pictures[title] = torch.stack(images) if colours else images[0]
+        parted = {(name := parts[0]["capture"]): [torch.from_numpy(one.image) for one in each]}
+        parted[f"{name} deviation"] = [torch.from_numpy(one.deviation) for one in each]
+        if all(capture.target is not None for capture in seen.values()):
+            parted[f"{name} truth"] = [_truth(capture, each[0].plane) for capture in seen.values()]
+        pictures |= {key: torch.stack(ones) if colours else ones[0] for key, ones in parted.items()}
         if (drawn := each[0].samples) is not None:
             shown = {f"{name} sample {k}": one for k, one in enumerate(drawn[:_SHOWN], 1)}
             pictures |= {**shown, f"{name} samples": drawn}
@@ -331,7 +322,7 @@ def _read_colours(folder: Path, evidence: Evidence) -> dict[Colour | None, Captu
 def _row_of_colours(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return lists of the figures of each colour; decibels are of the mean square, the time is that of all."""
     row: dict[str, Any] = {key: [one[key] for one in rows] for key in rows[0]}
-    row |= {"capture": rows[0]["capture"], "seconds": round(sum(row["seconds"]), 1)}
+    row |= {key: rows[0][key] for key in ("capture", "side_m")} | {"seconds": round(sum(row["seconds"]), 1)}
     return row | {key: _decibel_of(rows, key) for key in ("psnr_db", "expected_db")}
 
 
@@ -346,9 +337,10 @@ def _row(capture: Capture, found: TargetEstimate) -> dict[str, Any]:
         "psnr_db": target_psnr(capture, torch.from_numpy(found.image), size, motion),
         "expected_db": round(canvas_decibel(found.expected_error, found.plane, seen), 2),
         "level": _level(capture, torch.from_numpy(found.image), found.plane),
+        "side_m": size,
     }
     if capture.target is not None:
-        truth = capture.target.rasterise(found.plane)
+        truth = _truth(capture, found.plane).numpy()
         row["covered_90"] = round(float(((truth >= found.low) & (truth <= found.high)).mean()), 3)
     if found.samples is not None:
         row["open_share"] = round(found.open_share, 3)

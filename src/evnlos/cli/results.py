@@ -155,9 +155,9 @@ class TrackCommand:
 
         from evnlos.analysis import track_psnr
         from evnlos.cli.invert import save_arrays, show_tracks
-        from evnlos.cli.invert_captures import linear_setup
         from evnlos.data import pattern_of, read_capture
         from evnlos.plot.results import draw_inversion, draw_track
+        from evnlos.setups.load import linear_setup
         from evnlos.tracking import Tracks, track_capture, track_several, track_warnings
 
         image_path = self.out.with_stem(f"{self.out.stem}_image")

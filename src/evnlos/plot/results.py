@@ -161,8 +161,32 @@ def sequence_panels(
             known = "" if row["psnr_db"] is None else f", {row['psnr_db']:.1f} dB"
             image = pictures[f"{name}_{row['solver']}_{most}"]
             panels.append((f"{name}, {row['solver']}{known}", image.view(-1, *image.shape[-2:])))
+    return panels, _common_width_m(rows)
+
+
+def estimate_panels(
+    rows: Sequence[dict[str, Any]], pictures: Mapping[str, torch.Tensor]
+) -> tuple[list[tuple[str, torch.Tensor]], float | None]:
+    """Return titles and images of estimated captures, each after its truth, and their width as above.
+
+    Args:
+        rows: Figures of each capture.
+        pictures: By "CAPTURE" the image, followed by its deviation, truth, samples, [c, h, w] or [h, w] each.
+    """
+    panels = list[tuple[str, torch.Tensor]]()
+    for row in rows:
+        name, known = row["capture"], row["psnr_db"]
+        found = "" if known is None else f", {known:.1f} dB of {row['expected_db']:.1f} expected"
+        samples = [key for key in pictures if key.startswith(f"{name} sample ")]
+        for key in (f"{name} truth", name, f"{name} deviation", *samples):
+            if (image := pictures.get(key)) is not None:
+                panels.append((f"{key}{found if key == name else ''}", image.view(-1, *image.shape[-2:])))
+    return panels, _common_width_m(rows)
+
+
+def _common_width_m(rows: Sequence[dict[str, Any]]) -> float | None:
     sides = {row["side_m"] for row in rows}
-    return panels, sides.pop() if len(sides) == 1 else None
+    return sides.pop() if len(sides) == 1 else None
 
 
 def _draw_scale(axes: Any, shape: Sequence[int], side_m: float) -> None:

@@ -2,11 +2,14 @@
 
 - The words of a report for readers from elsewhere: explained at its end, linked where they first stand.
 - The report: one self-contained HTML page, with no requests to anywhere.
+- The page of a scene: its pictures, what of them is right, and the commands that made them.
 """
 
 from __future__ import annotations
 
 import html
+import mimetypes
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +45,8 @@ from evnlos.report.tables import (
     to_csv,
 )
 from evnlos.setups import NamedSetup
+
+_EMBEDDED_BYTES = 4_000_000  # larger images stay beside the page of a scene
 
 GLOSSARY = {
     "epnp": (
@@ -330,4 +335,45 @@ def _optics(dataset: Dataset, results: list[RunResult]) -> str:
         "and "
         "radius of the tPSF in camera pixels; distance up to which the sampled wave is true, in metres.</p>"
         + folded("Table", f"<div class=wide><table>{heads}{''.join(lines)}</table></div>")
+    )
+
+
+def scene_page(
+    title: str,
+    shows: str,
+    pictures: Mapping[str, str],
+    remarks: Mapping[str, str],
+    steps: Iterable[tuple[str, str]],
+    folder: Path,
+) -> str:
+    """Return the page of a scene that commands simulated and solved.
+
+    Args:
+        title: Its heading.
+        shows: What is hidden, and what sees it.
+        pictures: The caption of each file; one that is not there is named.
+        remarks: What to make of the pictures, each under its name.
+        steps: Each command, with what it printed.
+        folder: Where the files lie; large ones stay there beside the page.
+    """
+    figures = []
+    for file, caption in pictures.items():
+        kind, where = mimetypes.guess_type(file)[0] or "image/png", folder / file
+        if not where.is_file():  # the commands have said why, and go on
+            figures.append(f"<p>{html.escape(file)} is not there: images need evnlos[plot].</p>")
+            continue
+        is_small = where.stat().st_size <= _EMBEDDED_BYTES
+        source = data_uri(where.read_bytes(), kind) if is_small else html.escape(file)
+        image = f"<img class=moving src='{source}' alt='{html.escape(caption)}'>"
+        figures.append(f"<figure>{image}<figcaption>{html.escape(caption)}</figcaption></figure>")
+    return "\n".join(
+        [
+            page_head(title),
+            f"<h1>{html.escape(title)}</h1><p>{html.escape(shows)}</p>",
+            f"<div class=movies>{''.join(figures)}</div>",
+            *(f"<p><b>{html.escape(name)}.</b> {html.escape(text)}</p>" for name, text in remarks.items()),
+            "<h2>How</h2><p>Everything is simulated. These commands made it, in this folder:</p>",
+            *(f"<pre>$ {html.escape(step)}\n{html.escape(said)}</pre>" for step, said in steps),
+            "</html>",
+        ]
     )

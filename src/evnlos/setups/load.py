@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError, UnknownNameError
-from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup
+from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup, linear_kinds
 from evnlos.setups.files import CALIBRATED_FILE, OLDER_FILE, calibrated_file, stated_setup
 from evnlos.setups.measured import MeasuredSetup
 from evnlos.setups.paper import as_in_the_paper, rough_paper
@@ -156,6 +156,24 @@ def load_setup(word: str | Path) -> Setup:
     if path.suffix in (".yaml", ".yml"):
         raise UnknownNameError(f"{path} does not exist; give {_names()}, a settings file or a folder")
     return _named(str(word))
+
+
+def linear_setup(word: str | Path) -> Setup:
+    """Return the setup that a word stands for, which has to be linear.
+
+    Args:
+        word: As `load_setup` takes it.
+
+    Raises:
+        ConfigError: It is of another kind, or there is none.
+    """
+    setup = load_setup(word)
+    if not setup.is_linear:
+        raise ConfigError(
+            f"{word} holds a setup of kind {setup.kind}, which is not linear; give one of kind "
+            f"{' or '.join(linear_kinds())}"
+        )
+    return setup
 
 
 class NamedSetup(NamedTuple):
