@@ -131,6 +131,7 @@ WHOLE_CHAPTERS = {
     "events/batch.py",
     "events/files/aedat.py",
     "inverse/corner.py",
+    "inverse/event_images.py",
     "inverse/event_likelihood.py",
     "lab/light_path.py",
     "models/posterior.py",

@@ -36,6 +36,8 @@ from evnlos.inverse import (
     root_of,
     sequence_light,
 )
+from evnlos.live.packet import Chunk
+from evnlos.live.run import SoFar
 from evnlos.metrics import psnr
 from evnlos.models import SequenceConfig, Weights
 from evnlos.scene import HandwritingGlyphs, Scene, Target
@@ -363,6 +365,27 @@ def test_the_surface_so_far_is_that_of_the_events_so_far(tmp_path: Path) -> None
     whole = event_images(events, *given)
     scale = np.square(whole[-1]).mean()
     assert np.square(found[-1] - whole[-1]).mean() < 1e-3 * scale < np.square(found[1] - whole[1]).mean()
+
+
+def test_a_live_image_of_all_so_far_is_that_of_their_surface(tmp_path: Path) -> None:
+    save_yaml(to_dict(Simulation(setup=SETUP)), tmp_path / "setup.yaml")
+    events, edges = simulated(0), np.array([0, 8_000_000])
+    sampling = Sampling(surface="likelihood", setup=str(tmp_path / "setup.yaml"))
+    network = SequenceConfig(width=4, depth=1, rank=8).build("event", sampling).eval()
+    surface = event_images(events, edges, BENCH.motion, sampling.setup, sampling.canvas, so_far=True)
+    at = BENCH.motion.position_m(edges[1:] * 1e-6)
+    inputs = network.modality.inputs(np.zeros((1, 64, 96)), surface)
+    expected = network.seeing(replace(sampling, surface="so-far")).infer(inputs, at)[0].numpy()
+    given = Weights(network), BENCH.motion, (0, 8_000_000), events.shape
+    for parts in (1, 3):
+        running = SoFar(*given)
+        running.begin()
+        running.add([Chunk(events.between(0, 1_000_000), 1_000_000, 0.0, 0.0)])  # a replay that begins again
+        for first, stop in pairwise(np.linspace(0, 8_000_001, parts + 1).astype(int).tolist()):
+            running.add([Chunk(events.between(first, stop), stop - 1, 0.0, 0.0, restart=first == 0)])
+        running.finish()
+        assert np.square(running.newest - expected).mean() < 1e-3 * np.square(expected).mean()
+        assert 1 <= running.summary()["images"] <= parts + 1
 
 
 def test_the_surface_is_refused_without_setup_or_motion() -> None:

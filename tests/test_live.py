@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import re
+import shutil
 import socket
 import struct
 import sys
@@ -25,6 +26,7 @@ from evnlos import EvnlosError
 from evnlos.analysis import reconstruct
 from evnlos.analysis.identify import verdict_on
 from evnlos.cli import main
+from evnlos.config import read_yaml, save_yaml
 from evnlos.data import STANDARD_MODALITIES, Sampling, capture_samples, read_capture, reduce_by_area
 from evnlos.errors import ConfigError, DataError, EventFileError
 from evnlos.events import read_events, time_surface, write_events
@@ -34,9 +36,9 @@ from evnlos.live.engine import AreaReduction, Engine, Picture, RunningSurface, T
 from evnlos.live.growing_file import GrowingFile, open_tail
 from evnlos.live.packet import Chunk, ChunkQueue, Packet, PacketError, pack, unpack, unpack_all
 from evnlos.live.run import RateOptions, Run, RunStatistics, latency_table
-from evnlos.live.sources import Replay, SourceOptions, TimedFrame, capture_replay, open_live
+from evnlos.live.sources import Replay, SourceOptions, TimedFrame, capture_replay, open_live, so_far_of
 from evnlos.live.udp import UdpSender, UdpSource, send_timed
-from evnlos.models import UNetConfig, Weights, published_setup, save_weights
+from evnlos.models import SequenceConfig, UNetConfig, Weights, published_setup, save_weights
 from evnlos.setups import load_setup
 from evnlos.types import Events
 
@@ -694,6 +696,46 @@ def test_without_weights_published_ones_of_single_positions_are_taken(
     with pytest.raises(SystemExit) as stop:
         main(["live", str(tmp_path / "walk.raw"), "--weights", "near-event-sequence", "--headless"])
     assert stop.value.code == 2 and "near-event or near-frame, which come with" in capsys.readouterr().err
+
+
+def test_the_image_of_all_so_far_stands_beside_a_replay(tiny_captures, tmp_path: Path, capsys) -> None:
+    sampling, folder = Sampling(**ABOUT), str(tiny_captures[0])
+    network = SequenceConfig(width=4, depth=1, rank=4).build("frame", sampling).eval()
+    save_weights(tmp_path / "all.safetensors", Weights(network))
+    save_weights(tmp_path / "one.safetensors", weights("frame"))
+    both = ["--weights", str(tmp_path / "one.safetensors"), "--so-far", str(tmp_path / "all.safetensors")]
+    call = ["live", folder, *both, "--headless", "--json", "--speed", "20"]
+    main([*call, "--out", str(tmp_path / "out")])
+    table = recorded(tmp_path / "out", capsys)
+    assert table["so_far"]["images"] >= 1 and table["images"] > 0
+    capture, beside = read_capture(folder), so_far_of(tmp_path / "all.safetensors", folder)
+    samples = capture_samples(capture, sampling)
+    beside.begin()
+    for part in capture_replay(folder, speed=10, clock=Turned()).chunks(NEVER):
+        beside.add([part])
+    beside.finish()
+    seen = network.modality.inputs(samples.frame, samples.surface)
+    expected = network.infer(seen, samples.position_m, so_far=True)[-1].numpy()
+    np.testing.assert_allclose(beside.newest, expected, atol=1e-5)
+    picture = Engine(weights("frame")).see([chunk(stream(9), frame=np.ones((20, 30)))])
+    assert picture is not None
+    names = list(record.panels(replace(picture, so_far=beside.newest)))
+    assert names == [*record.panels(picture), "of all so far"]
+
+
+def test_an_image_of_all_so_far_knows_what_it_needs(tiny_captures, tmp_path: Path) -> None:
+    save_weights(tmp_path / "one.safetensors", weights("frame"))
+    with pytest.raises(DataError, match="give weights of whole sequences"):
+        so_far_of(tmp_path / "one.safetensors", str(tiny_captures[0]))
+    write_events(tmp_path / "walk.raw", stream(500, 21))
+    with pytest.raises(ConfigError, match="has to know the motion"):
+        so_far_of("near-event-sequence", str(tmp_path / "walk.raw"))
+    folder = tmp_path / "still"
+    shutil.copytree(tiny_captures[0], folder)
+    about = read_yaml(folder / "capture.yaml")
+    save_yaml({key: value for key, value in about.items() if key != "motion"}, folder / "capture.yaml")
+    with pytest.raises(DataError, match="states no motion"):
+        so_far_of("near-event-sequence", str(folder))
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:

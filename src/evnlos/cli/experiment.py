@@ -29,7 +29,7 @@ from evnlos.demo import LAB_CHARACTERS, Demo, held_out, run_demo
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
-from evnlos.live.sources import SourceOptions, check_source, open_live
+from evnlos.live.sources import SourceOptions, check_source, open_live, so_far_of
 from evnlos.machine import ProgressBars
 from evnlos.types import OutFolder
 
@@ -322,6 +322,9 @@ class LiveCommand:
     """Port of the page on 127.0.0.1; 0 = any that is free."""
     pattern: Path | None = None
     """Fixed pattern to take from a capture's frames: the file that `calibrate` wrote, or its folder."""
+    so_far: Path | None = None
+    """Weights of whole sequences (near-event-sequence): beside the image of the instant, one of all seen so
+    far, as often as it is worth it. SOURCE is then a capture that states its motion."""
     threads: int = 1
     """Threads of the network; more are quicker only where cores have nothing else to do."""
     json: bool = False
@@ -361,20 +364,18 @@ class LiveCommand:
         try:
             with ExitStack() as stack:
                 if model is None:
-                    modality = "frame" if source.has_frames else "event"
-                    name = published_for(None, modality, is_motion_known=False)
+                    name = published_for(None, "frame" if source.has_frames else "event", is_motion_known=False)
                     model = load_model(name)
                     say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
                 engine = Engine(model.weights)
                 verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE, is_stated=False)
-                run = Run(source, engine, self.pace)
+                beside = None if self.so_far is None else so_far_of(self.so_far, self.source)
+                run = Run(source, engine, self.pace, so_far=beside)
                 sinks = []
                 if not self.headless:
                     title, again = f"{source.name}, {engine.modality.name}", getattr(source, "again", None)
-                    page = Page(
-                        lambda: run.statistics.now() | {"verdict": verdict.lines}, self.port, title, again
-                    )
-                    stack.enter_context(page)
+                    told = lambda: run.statistics.now() | {"verdict": verdict.lines}  # noqa: E731
+                    page = stack.enter_context(Page(told, self.port, title, again))
                     sinks.append(page)
                     say(f"{page.url} shows the images; Ctrl-C ends")
                     if source.waits:
@@ -386,7 +387,7 @@ class LiveCommand:
         finally:
             source.close()
         about = {"weights": str(name), "modality": engine.modality.name, "verdict": asdict(verdict)}
-        summary = run.statistics.summary() | about
+        summary = run.statistics.summary() | about | ({"so_far": beside.summary()} if beside else {})
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
             write_atomically(out / "latency.json", (json.dumps(summary, indent=1) + "\n").encode())

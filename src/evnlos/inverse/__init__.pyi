@@ -18,6 +18,7 @@ from .event_images import EVENT_ERRORS as EVENT_ERRORS
 from .event_images import EVENT_ERRORS_FILE as EVENT_ERRORS_FILE
 from .event_images import AboutErrors as AboutErrors
 from .event_images import EventErrors as EventErrors
+from .event_images import RunningEventImages as RunningEventImages
 from .event_images import event_images as event_images
 from .event_images import event_prior as event_prior
 from .event_images import gains_by_errors as gains_by_errors

@@ -217,6 +217,7 @@ class _Sequence(NamedTuple):
 
     solver: EventSolver
     prior: PatternPrior
+    began_us: int
     events: Events
     instants_s: NDArray[np.float64]
     position_m: NDArray[np.float64]
@@ -261,7 +262,7 @@ def _sequence(
             "the motion is unknown, and the surfaces 'likelihood' and 'so-far' need it; state it in "
             "capture.yaml (`evnlos track` finds it)"
         )
-    edges_us = np.asarray(edges_us, np.int64)
+    edges_us, began_us = np.asarray(edges_us, np.int64), 0
     if isinstance(motion, LineMotion):  # on the motion's own clock the recordings of a setup share a light path
         began_us = round(1e6 * motion.start_s)
         motion, edges_us = replace(motion.in_its_plane(), start_s=0.0), edges_us - began_us
@@ -270,7 +271,7 @@ def _sequence(
     solver, prior = _solver(setup, motion, span, (events.height, events.width), side_m)
     note("what the events say")
     instants_s = np.asarray(edges_us[1:] * 1e-6, np.float64)
-    return _Sequence(solver, prior, events, instants_s, motion.position_m(instants_s))
+    return _Sequence(solver, prior, began_us, events, instants_s, motion.position_m(instants_s))
 
 
 def event_images(
@@ -304,7 +305,7 @@ def event_images(
     """
     errors = None if capture is None else event_errors(setup, "give --sampling.surface likelihood")
     seen = _sequence(events, edges_us, motion, setup, target_side_m(canvas))
-    side_m, places = seen.prior.target_plane.extent_m[0], seen.position_m
+    places = seen.position_m
     steps = _worth_solving(seen) if so_far else [0]
     until = seen.instants_s[steps] if so_far else seen.solver.light.times_s[-1:]
     from threadpoolctl import threadpool_limits  # whose import changes the environment
@@ -315,10 +316,67 @@ def event_images(
         for first, after, statistic in zip(steps, [*steps[1:], len(places)], found, strict=True):
             if errors is not None and capture is not None:
                 statistic = errors.corrected(statistic, capture)
-            for k, z in enumerate(statistic.solutions(EVENT_PRIORS)):
-                target = Target("events", np.clip(seen.prior.image(z), 0.0, 1.0).astype(np.float32), side_m)
-                images[first:after, k] = target.rasterise(canvas, places[first:after])
+            images[first:after] = _drawn(statistic, seen.prior, canvas, places[first:after])
     return images
+
+
+def _drawn(
+    statistic: EventStatistic, prior: PatternPrior, canvas: Plane, position_m: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return the solutions at both priors where the target is at N instants, [N, 2, h, w]."""
+    images = np.empty((len(position_m), len(EVENT_PRIORS), *canvas.shape), np.float32)
+    for k, z in enumerate(statistic.solutions(EVENT_PRIORS)):
+        seen = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)
+        target = Target("events", seen, prior.target_plane.extent_m[0])
+        images[:, k] = target.rasterise(canvas, position_m)
+    return images
+
+
+class RunningEventImages:
+    """The target that events show while they come: `event_images` of those so far, one instant after the other.
+
+    Each search begins where the last one ended. A run in a thread beside others leaves them the interpreter.
+
+    Args:
+        span_us: First and last instant of the sequence, microseconds on the events' clock.
+        motion: Of the target.
+        setup: Word of a setup whose light path and event pixel are known.
+        canvas: What is drawn.
+        shape: Rows and columns of the event camera.
+
+    Raises:
+        ConfigError: As for `event_images`.
+        DataError: As for `event_images`.
+    """
+
+    def __init__(
+        self, span_us: tuple[int, int], motion: Motion | None, setup: str, canvas: Plane, shape: tuple[int, int]
+    ) -> None:
+        none = Events.empty(shape[1], shape[0])
+        self._seen = _sequence(none, np.asarray(span_us), motion, setup, target_side_m(canvas))
+        self._canvas, self._last_s = canvas, float(self._seen.solver.light.times_s[-1])
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what events said before."""
+        self._unknown = self._seen.solver.nothing_known()
+
+    def at(self, events: Events, until_us: int, position_m: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return both images, float32 [2, h, w], of the events up to an instant.
+
+        Args:
+            events: All since the beginning; later ones are passed over.
+            until_us: The instant, microseconds; after the last of the sequence counts as that.
+            position_m: Where the target is drawn, (x, y) in metres.
+        """
+        began_us, solver = self._seen.began_us, self._seen.solver
+        until_s = min((until_us - began_us) * 1e-6, self._last_s)
+        moved = replace(events, t_us=events.t_us - began_us)
+        from threadpoolctl import threadpool_limits  # whose import changes the environment
+
+        with threadpool_limits(1):
+            statistic = solver.solved(moved, until_s, self._unknown)
+            return _drawn(statistic, self._seen.prior, self._canvas, np.reshape(position_m, (1, 2)))[0]
 
 
 def _worth_solving(seen: _Sequence) -> list[int]:

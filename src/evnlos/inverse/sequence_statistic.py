@@ -43,7 +43,7 @@ _ACTIVE = 0.01  # weight of a silence, in that of a threshold just met, below wh
 _SAFE = 1e-3  # white levels under which no light is taken to lie
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _level(bright, scale, offset):
     """Return log light of a light in DN, and its derivative by the light, per DN."""
     bright = max(scale * bright + offset, 0.0)
@@ -52,7 +52,7 @@ def _level(bright, scale, offset):
     return bright * KNEE_SLOPE, scale * KNEE_SLOPE
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _at_instants(light, pixel, at, scale, offset, speed, floor, node, before, values):
     """Fill what the light of `pixel` [N] is at instants `at` [N], in nodes.
 
@@ -78,7 +78,7 @@ def _at_instants(light, pixel, at, scale, offset, speed, floor, node, before, va
         node[n], before[n] = (k if place - k < 0.5 else k + 1), k
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _furthest(origin, sign, change, up, down):
     """Fill where the level of each gap is furthest up and down, by the instant that it begins at; -1 = none."""
     up[:] = -1
@@ -91,7 +91,7 @@ def _furthest(origin, sign, change, up, down):
             down[start] = n
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _rows(seen, place, at, origin, slope, wait, rows):
     """Fill the derivatives of the changes of instants `at` by the coefficients and the leak, [n, k + 1]."""
     count = seen.shape[1]
@@ -103,7 +103,7 @@ def _rows(seen, place, at, origin, slope, wait, rows):
         rows[n, count] = wait[at[n]]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _rate_rows(moved, seen, place, slope, bend, rows):
     """Fill the derivatives of the rates by the coefficients and the leak, [n, k + 1]."""
     count = seen.shape[1]
@@ -114,7 +114,7 @@ def _rate_rows(moved, seen, place, slope, bend, rows):
         rows[n, count] = 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _sums(rows, weight, residual, group, summed, total, seen):
     """Add up w J [G, k + 1], w and w y [G] of the groups of rows; equal numbers lie side by side."""
     place = -1
@@ -176,9 +176,13 @@ class EventSolver:
             if len(self._left) >= _FEWEST_PIXELS * stride**2
         ]
 
+    def nothing_known(self) -> Array:
+        """Return the unknowns, coefficients and what is added to the leak, before any event: zeros [k + 1]."""
+        return np.zeros(self._seen.shape[2] + 1)
+
     def __call__(self, events: Events) -> EventStatistic:
         """Return the statistic of a sequence's events, on the clock of the light."""
-        return self._solved(events, float(self.light.times_s[-1]), np.zeros(self._seen.shape[2] + 1))
+        return self.solved(events, float(self.light.times_s[-1]), self.nothing_known())
 
     def so_far(self, events: Events, instants_s: Array) -> Iterator[EventStatistic]:
         """Yield the statistic of the events up to each instant; each estimate starts from the one before.
@@ -187,11 +191,18 @@ class EventSolver:
             events: Of the whole sequence, on the clock of the light.
             instants_s: Ascending, within the light's, seconds.
         """
-        unknown = np.zeros(self._seen.shape[2] + 1)
+        unknown = self.nothing_known()
         for until_s in instants_s.tolist():
-            yield self._solved(events, until_s, unknown)
+            yield self.solved(events, until_s, unknown)
 
-    def _solved(self, events: Events, until_s: float, unknown: Array) -> EventStatistic:
+    def solved(self, events: Events, until_s: float, unknown: Array) -> EventStatistic:
+        """Return the statistic of the events up to an instant; `unknown` is changed.
+
+        Args:
+            events: On the clock of the light, later ones too.
+            until_s: The instant, seconds.
+            unknown: Coefficients and what is added to the leak, [k + 1], to start from.
+        """
         span = (float(self.light.times_s[0]), until_s)
         record = record_of(events, self.law, span, self.settings.gap_s)
         noises = self.settings.noise_in(np.arange(FIRST_STEPS), ANNEALED)

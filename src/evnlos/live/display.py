@@ -36,7 +36,8 @@ _HEIGHT_PX, _GAP_PX = 256, 8
 def panels(picture: Picture) -> dict[str, NDArray[np.uint8]]:
     """Return what there is to see, by name, in the order of the light path: uint8 [H, W] or [H, W, 3]."""
     shown = {"wall": stretched(picture.frame)} if picture.frame is not None else {}
-    return shown | {"events": polarity(picture.surface), "reconstruction": grey(picture.image)}
+    shown |= {"events": polarity(picture.surface), "reconstruction": grey(picture.image)}
+    return shown if picture.so_far is None else shown | {"of all so far": grey(picture.so_far)}
 
 
 def side_by_side(picture: Picture) -> NDArray[np.uint8]:

@@ -202,6 +202,8 @@ class Picture:
         frame: The frame that it saw, float32 [H, W], 0..1; None without frames.
         events: Number of events that are new in it.
         timing: How long it took.
+        so_far: The newest image of all that was seen so far, float32 [H, W], 0..1, black before the first; None
+            where none is made.
     """
 
     number: int
@@ -212,6 +214,7 @@ class Picture:
     frame: NDArray[np.float32] | None
     events: int
     timing: Timing
+    so_far: NDArray[np.float32] | None = None
 
 
 class StreamingReconstructor:

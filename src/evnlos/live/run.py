@@ -1,24 +1,30 @@
 """A live run, and its statistics.
 
 - What a live run did: images, latencies, drops, rates; as numbers and as a table.
+- The image of all that was seen so far, made beside a run in a thread of its own, as often as it is worth it.
 - A live run: the source fills a queue in its own thread, the network empties it, sinks get the images.
 """
 
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.live.packet import ChunkQueue, Clock, EventSource, SystemClock
+from evnlos.live.packet import Chunk, ChunkQueue, Clock, EventSource, SystemClock
+from evnlos.types import Events
 
 if TYPE_CHECKING:
     from evnlos.live.engine import Engine, Picture
+    from evnlos.models import Weights
+    from evnlos.scene import Motion
 
 _KEPT = 100_000  # images whose times are kept: half an hour at 50 a second, 6 MB
 _RECENT = 100
@@ -151,6 +157,147 @@ class RateOptions:
             raise ConfigError(f"seconds is {self.seconds}; give a positive number")
 
 
+_WORTH, _FEWEST_EVENTS = 1.1, 500  # times as many events as the image before knew; for the first
+
+
+class SoFar:
+    """The image of all that was seen so far, made beside a run in a thread of its own.
+
+    A network of whole sequences sees the target that the events so far make most likely, and all frames so far
+    but the first: images of `evnlos reconstruct --so-far`, but for where each search begins.
+
+    Args:
+        weights: Such a network; its samples name the setup whose light path is undone.
+        motion: Of the target, on the clock of the source.
+        span_us: First and last instant of the sequence, microseconds.
+        shape: Rows and columns of the event camera.
+
+    Attributes:
+        newest: The newest image, float32 [H, W], 0..1; black before the first.
+        seconds: How long each image took.
+
+    Raises:
+        ConfigError: The setup is unknown.
+        DataError: The network sees single time steps, or surfaces that are no likelihood.
+    """
+
+    def __init__(
+        self, weights: Weights, motion: Motion, span_us: tuple[int, int], shape: tuple[int, int]
+    ) -> None:
+        from evnlos.inverse import RunningEventImages
+
+        network, sampling = weights.network, weights.sampling
+        if not network.sees_sequence or (weights.modality.needs_events and not sampling.is_solved):
+            raise DataError(
+                "these weights do not see what all events and frames so far say of the target; give weights of "
+                "whole sequences and the surface 'likelihood', such as near-event-sequence"
+            )
+        self._network = network.seeing(replace(sampling, surface="so-far")).eval()
+        self._modality, self._motion, self._canvas = weights.modality, motion, sampling.canvas
+        known = span_us, motion, sampling.setup, sampling.canvas, shape
+        self._events = RunningEventImages(*known) if self._modality.needs_events else None
+        self.seconds = list[float]()
+        self._fault: DataError | None = None
+        self._news, self._ended = threading.Condition(), False
+        self._thread: threading.Thread | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._parts, self._count = list[Events](), 0
+        self._frames, self._times_us = list[NDArray[np.float32]](), list[int]()
+        self._until_us, self._known, self._frames_known = 0, 0, 0
+        self._is_new = True
+        self.newest = np.zeros(self._canvas.shape, np.float32)
+
+    def begin(self) -> None:
+        """Start the thread."""
+        self._thread = threading.Thread(target=self._work, name="so far", daemon=True)
+        self._thread.start()
+
+    def add(self, chunks: Sequence[Chunk]) -> None:
+        """Take what came, without waiting for an image."""
+        with self._news:
+            for chunk in chunks:
+                if chunk.restart:
+                    self._forget()
+                self._parts += [chunk.events] if len(chunk.events) else []
+                self._count += len(chunk.events)
+                self._until_us = chunk.until_us
+                if chunk.frame is not None:
+                    self._frames.append(np.ascontiguousarray(chunk.frame, np.float32))
+                    self._times_us.append(chunk.until_us if chunk.frame_us is None else chunk.frame_us)
+            self._news.notify()
+
+    def finish(self) -> None:
+        """Wait for the image of everything.
+
+        Raises:
+            DataError: There was never an image, and why.
+        """
+        with self._news:
+            self._ended = True
+            self._news.notify()
+        if self._thread is not None:
+            self._thread.join()
+        if self._fault is not None and not self.seconds:
+            raise self._fault
+
+    def summary(self) -> dict[str, Any]:
+        """Return how many images there were, and the median of their times, seconds."""
+        return {"images": len(self.seconds), "seconds": round(float(np.median(self.seconds or [0.0])), 3)}
+
+    def _is_worth(self) -> bool:
+        """Return whether enough came since the image before; at the end anything is."""
+        if self._modality.needs_frames and len(self._frames) < 2:
+            return False
+        if self._events is None:
+            return len(self._frames) > self._frames_known
+        least = self._known + 1 if self._ended else max(_FEWEST_EVENTS, _WORTH * self._known)
+        return self._count >= least
+
+    def _work(self) -> None:
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._ended or self._is_worth())
+                if not self._is_worth():
+                    return
+                seen = Events.concatenate(self._parts) if self._parts else None
+                self._parts = [] if seen is None else [seen]
+                self._known, self._frames_known = self._count, len(self._frames)
+                frames, times_us, until_us = self._frames[1:], self._times_us[1:], self._until_us
+                if self._is_new and self._events is not None:
+                    self._events.begin()
+                self._is_new = False
+            began_s = time.perf_counter()
+            try:
+                image = self._image(seen, frames, times_us, until_us)
+            except DataError as error:  # the target is off the canvas yet
+                self._fault = error
+                continue
+            with self._news:
+                if not self._is_new:  # else it began anew meanwhile
+                    self.newest = image
+                    self.seconds.append(time.perf_counter() - began_s)
+
+    def _image(
+        self, events: Events | None, frames: list[NDArray], times_us: list[int], until_us: int
+    ) -> NDArray[np.float32]:
+        import torch
+
+        from evnlos.data.sampling import reduce_by_area
+
+        if not self._modality.needs_frames:
+            frames, times_us = [np.zeros(self._canvas.shape, np.float32)], [until_us]
+        at = self._motion.position_m(np.asarray(times_us, np.float64) * 1e-6)
+        surface = np.zeros((len(frames), 2, *self._canvas.shape), np.float32)
+        if self._events is not None and events is not None:
+            surface[-1] = self._events.at(events, times_us[-1], at[-1])
+        seen = self._modality.inputs(reduce_by_area(np.stack(frames), self._canvas.shape), surface)
+        with torch.inference_mode():
+            place = torch.from_numpy(at.astype(np.float32))
+            return self._network.draw(seen, place, place[-1:])[0].numpy()
+
+
 class Sink(Protocol):
     """Something that takes images without making the run wait."""
 
@@ -167,6 +314,7 @@ class Run:
         engine: What makes images of them.
         pace: How often, and how much may wait.
         clock: The clock that it goes by.
+        so_far: What makes the image of all so far beside it.
 
     Attributes:
         statistics: What it did so far.
@@ -176,14 +324,19 @@ class Run:
     """
 
     def __init__(
-        self, source: EventSource, engine: Engine, pace: RateOptions = RateOptions(), clock: Clock | None = None
+        self,
+        source: EventSource,
+        engine: Engine,
+        pace: RateOptions = RateOptions(),
+        clock: Clock | None = None,
+        so_far: SoFar | None = None,
     ) -> None:
         if engine.needs_frames and not source.has_frames:
             raise DataError(
                 f"weights of the modality {engine.modality.name!r} see frames and {source.name} has none; give "
                 "the folder of a capture, or weights of the modality 'event'"
             )
-        self._source, self._engine, self._pace = source, engine, pace
+        self._source, self._engine, self._pace, self._so_far = source, engine, pace, so_far
         self._clock = clock or SystemClock()
         self._queue = ChunkQueue(pace.queue_events)
         self._stop = threading.Event()
@@ -199,8 +352,10 @@ class Run:
         Raises:
             EvnlosError: The source can't go on; earlier images were made.
         """
-        sinks = list(sinks)
+        sinks, so_far, last = list(sinks), self._so_far, None
         self._engine.begin()
+        if so_far is not None:
+            so_far.begin()
         start_s = due_s = self._clock.now()
         pump = threading.Thread(target=self._pump, name="source", daemon=True)
         pump.start()
@@ -214,12 +369,20 @@ class Run:
                 chunks = self._queue.take(_NAP_S)
                 taken_s = self._clock.now()
                 picture = self._engine.see(chunks) if chunks else None
+                if so_far is not None:
+                    so_far.add(chunks)
+                    picture = picture and replace(picture, so_far=so_far.newest)
                 if picture is not None:
+                    last = picture
                     due_s = taken_s + 1 / self._pace.rate
                     self.statistics.add(picture)
                     for sink in sinks:
                         sink.show(picture)
             self._queue.take(0)  # raises what ended the source
+            if so_far is not None:
+                so_far.finish()
+                for sink in sinks if last is not None else ():
+                    sink.show(replace(last, number=last.number + 1, so_far=so_far.newest))
         except KeyboardInterrupt:
             pass  # the way to end what has no end
         finally:

@@ -17,12 +17,13 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.errors import ConfigError, UnknownNameError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
 from evnlos.live.device import DEVICES, DeviceSource, NeuromorphicDriver, device_of
 from evnlos.live.growing_file import GrowingFile
 from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
+from evnlos.live.run import SoFar
 from evnlos.live.streams import DvSource, WordInput
 from evnlos.live.udp import AestreamSource, UdpSource
 from evnlos.types import Events
@@ -304,6 +305,34 @@ def capture_replay(
     times = capture.frame_times_us[: len(images)]
     frames = [TimedFrame(int(t), image) for t, image in zip(times, images, strict=True)]
     return Replay([capture.events], frames, speed=speed, clock=clock, name=str(folder), repeat=repeat)
+
+
+def so_far_of(weights: str | Path, source: str) -> SoFar:
+    """Return what makes the image of all that was seen so far of a capture that is replayed.
+
+    Args:
+        weights: Weights of whole sequences: a file, a run's folder, or a name.
+        source: The capture's folder.
+
+    Raises:
+        ConfigError: The source is no capture.
+        DataError: The capture states no motion, or lacks what the network sees; or the weights do not fit.
+    """
+    from evnlos.data import read_capture
+    from evnlos.models import load_weights
+
+    if not (Path(source) / "capture.yaml").is_file():
+        raise ConfigError(
+            f"--so-far with {source}: an image of all seen so far has to know the motion; give the folder of a "
+            "capture that states it"
+        )
+    loaded, capture = load_weights(weights), read_capture(source, needs_frames=False, needs_events=False)
+    eyes = loaded.modality
+    capture.info.check_cameras(capture.name, frames=eyes.needs_frames, events=eyes.needs_events)
+    if capture.motion is None:
+        raise DataError(f"{source} states no motion; --so-far needs it (`evnlos track` finds it)")
+    first_us, last_us = (int(capture.frame_times_us[k]) for k in (0, -1))
+    return SoFar(loaded, capture.motion, (first_us, last_us), capture.events.shape)
 
 
 def _address(source: str) -> tuple[str, int]:
