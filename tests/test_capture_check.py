@@ -136,6 +136,8 @@ def test_events_that_are_wrong_are_named(capture) -> None:
         width=events.width, height=events.height, **(columns | {"p": np.ones(len(events), bool)})
     )
     assert levels(replace(capture, events=one_sided))["polarity balance"] == "bad"
+    few_off = replace(one_sided, p=np.arange(len(events)) % 20 > 0)  # 95 % ON: a sensor that calibration can fit
+    assert levels(replace(capture, events=few_off))["polarity balance"] == "doubtful"
     at_one = np.sort(np.concatenate([np.arange(len(events)), np.full(len(events), 5)]))
     x, y = columns["x"][at_one].copy(), columns["y"][at_one].copy()
     x[at_one == 5], y[at_one == 5] = 7, 7
