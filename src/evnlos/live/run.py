@@ -199,7 +199,7 @@ class SoFar:
         self.seconds = list[float]()
         self._fault: DataError | None = None
         self._news, self._ended = threading.Condition(), False
-        self._thread: threading.Thread | None = None
+        self._thread = threading.Thread(target=self._work, name="so far", daemon=True)
         self._forget()
 
     def _forget(self) -> None:
@@ -211,7 +211,6 @@ class SoFar:
 
     def begin(self) -> None:
         """Start the thread."""
-        self._thread = threading.Thread(target=self._work, name="so far", daemon=True)
         self._thread.start()
 
     def add(self, chunks: Sequence[Chunk]) -> None:
@@ -237,8 +236,7 @@ class SoFar:
         with self._news:
             self._ended = True
             self._news.notify()
-        if self._thread is not None:
-            self._thread.join()
+        self._thread.join()
         if self._fault is not None and not self.seconds:
             raise self._fault
 
@@ -381,8 +379,10 @@ class Run:
             self._queue.take(0)  # raises what ended the source
             if so_far is not None:
                 so_far.finish()
-                for sink in sinks if last is not None else ():
-                    sink.show(replace(last, number=last.number + 1, so_far=so_far.newest))
+                if last is not None:
+                    whole = replace(last, number=last.number + 1, so_far=so_far.newest)
+                    for sink in sinks:
+                        sink.show(whole)
         except KeyboardInterrupt:
             pass  # the way to end what has no end
         finally:
