@@ -125,6 +125,7 @@ WHOLE_CHAPTERS = {
     "analysis/confidence.py",
     "app/views.py",
     "calibration/scan/film.py",
+    "cameras/frame_camera.py",
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",

@@ -37,8 +37,9 @@ from evnlos.calibration import (
 from evnlos.calibration.captures import paper
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import block_counts, count_map, read_recordings, within
-from evnlos.calibration.frame_model import frame_doubt, working_shape
+from evnlos.calibration.frame_model import working_shape
 from evnlos.calibration.transport_fit import clustered_error, levenberg_marquardt, values_of
+from evnlos.calibration.wall_search import frame_doubt
 from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
@@ -442,7 +443,9 @@ def test_noise_of_a_camera_without_light_on_it() -> None:
 
     class OneShot:
         peak = 255
-        captures = (type("C", (), {"info": type("I", (), {"camera": type("K", (), {"exposure_s": 0.0})})}),)
+        captures = (
+            type("C", (), {"info": type("I", (), {"camera": type("K", (), {"exposure_s": 0.0, "log": None})})}),
+        )
 
         def frames(self):
             return frames

@@ -308,6 +308,11 @@ def _network(values: dict[str, Any]) -> dict[str, Any]:
     return _renamed(values, strengths="ridge_multipliers")
 
 
+def _linear_camera(values: dict[str, Any]) -> dict[str, Any]:
+    """Leave the kind of a linear frame camera out, which it does not state: its files are as of old."""
+    return {key: value for key, value in values.items() if (key, value) != ("kind", "linear")}
+
+
 def _glyphs(values: dict[str, Any]) -> dict[str, Any]:
     """Hidden characters of any kind."""
     return _renamed(values, plate="target_plane")
@@ -358,9 +363,7 @@ def _one_setup(values: dict[str, Any]) -> dict[str, Any]:
 def _path_in_setup(path: str) -> str:
     path = path.replace("glyphs.plate.", "glyphs.target_plane.")
     section, _, rest = path.partition(".")
-    if section == "transport":
-        return f"setup.{_PAPER.get(rest, rest)}"
-    if section == "setup":
+    if section in ("transport", "setup"):
         return f"setup.{_PAPER.get(rest, rest)}"
     return f"setup.{path}" if section in _CAMERAS else path
 
@@ -390,6 +393,7 @@ _STEPS: dict[str, tuple[Step, ...]] = {
     "CaptureInfo": (partial(_renamed, rig="setup"),),
     "TargetInfo": (partial(_renamed, plate_m="size_m"),),
     "PaperSetup": (_paper_setup,),
+    "FrameCamera": (_linear_camera,),
     **dict.fromkeys(_GLYPHS, (_glyphs,)),
     **dict.fromkeys(("UNetConfig", "SequenceConfig"), (_network,)),
 }

@@ -249,7 +249,7 @@ def frame_information(
         now = np.full(len(everywhere), instants[k])
         rows = light.rows(everywhere, now)
         there = torch.from_numpy(light.at(seen, everywhere, now))
-        weight = ((there < 1 / camera.gain) / camera.noise_variance(there)).numpy()  # clipped ones tell nothing
+        weight = (camera.shows(there) / camera.noise_variance(there)).numpy()  # clipped ones tell nothing
         one = NormalEquations.empty(len(z))
         one.add(rows, weight, np.zeros(len(rows)), everywhere, 0.0)
         for n, mine in enumerate(chosen):

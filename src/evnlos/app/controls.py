@@ -305,7 +305,7 @@ def simulate_sequence(controls: Controls, target: Target) -> Recorded:
     scene = Scene(target, simulation.motion, simulation.duration_s)
     wall = simulation.setup.observe(scene)
     times_s = scene.position_times_s(simulation.positions)
-    camera: FrameCamera = simulation.frame_camera
+    camera = simulation.frame_camera
     events = EventCamera(simulation.pixel, _TOLERANCE, simulation.setup.time_step_s).record(
         wall, 0.0, simulation.duration_s, seed=derive_seed(controls.seed, "events")
     )

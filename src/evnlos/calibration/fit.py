@@ -20,9 +20,9 @@ from evnlos.calibration.blind_calibration import fit_blind
 from evnlos.calibration.captures import Calibration, CaptureSet, read_capture_set
 from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
-from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise, frame_doubt
+from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
-from evnlos.calibration.wall_search import check_measured, fit_wall
+from evnlos.calibration.wall_search import check_measured, fit_wall, frame_doubt
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
 from evnlos.data.simulate import Simulation, ranges_around
@@ -348,6 +348,7 @@ _SPREAD = {
     "setup.ambient": 0.08,
     "setup.frame_camera.full_well_e": 0.1,
     "setup.frame_camera.read_noise_e": 0.1,
+    "setup.frame_camera.noise_codes": 0.1,
     "setup.pixel.threshold_on": 0.05,
     "setup.pixel.threshold_off": 0.05,
     "setup.pixel.shot_noise_rate_hz": 0.1,
@@ -375,7 +376,6 @@ def training_simulation(
         pixel: The fitted event pixel; None where only frames were fitted.
         shown: The known targets; none where they are unknown.
     """
-    prnu, dsnu = noise.remaining
     glyphs = fitted.glyphs
     if isinstance(glyphs, HandwritingGlyphs):
         glyphs = written_alike(replace(glyphs, strokes=Strokes("both")), shown)
@@ -387,7 +387,7 @@ def training_simulation(
         if pixel.cutoff_range_hz is not None:
             vary["setup.pixel.cutoff_hz"] = pixel.cutoff_range_hz
         vary["setup.pixel.leak_rate_hz"] = (0.0, max(_LEAK_HZ, getattr(pixel.pixel, "leak_rate_hz", 0.0)))
-    camera = replace(fitted.frame_camera, prnu=prnu, dsnu_e=dsnu, pattern_seed=None)
+    camera = replace(fitted.frame_camera, **noise.remaining, pattern_seed=None)  # type: ignore[type-var]
     return replace(
         fitted, glyphs=glyphs, setup=replace(fitted.setup, frame_camera=camera), vary=vary, setups=_SETUPS
     )

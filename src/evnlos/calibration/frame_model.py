@@ -7,25 +7,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.captures import CaptureSet
-from evnlos.cameras import FrameCamera
+from evnlos.cameras import FrameCamera, FrameCameraSettings, LogCodes, LogFrameCamera
 from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import FrameTerm, SequenceLights, handwritten_prior
-from evnlos.scene import Ink
 from evnlos.setups import Setup
 from evnlos.types import Plane
-
-FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-"""By how much the variance of the frames' noise may be raised."""
-_GRID, _CELLS = (50, 80), 32  # pixels on which captures are solved, and cells of the target
 
 
 @dataclass(frozen=True)
@@ -209,6 +202,11 @@ def fitting_strip(setup: Setup, capture_set: CaptureSet) -> Setup:
 _BINS = 24
 _LARGEST_WELL_E = 1e6
 _OPEN = 0.9  # share of the largest number above which noise may be clipped
+FITTED = {
+    "linear": {"full_well_e": "electrons", "read_noise_e": "electrons", "prnu": "", "dsnu_e": "electrons"},
+    "log": {"noise_codes": "codes of 12 bits", "pattern_codes": "codes of 12 bits"},
+}
+"""What is fitted to the noise, with its unit, by the kind of the frame camera."""
 
 
 @dataclass(frozen=True)
@@ -219,30 +217,30 @@ class FrameNoise:
         camera: The frame camera that makes this noise.
         temporal: Standard deviation of the noise that changes from frame to frame, white levels.
         pattern: Sensitivity and offset of each pixel, the most probable ones.
-        remaining: Standard deviations of sensitivity (fraction) and offset (electrons) that stay after
-            correction by the pattern.
+        remaining: Settings of the camera's fixed pattern that stay after correction by `pattern`, by name.
     """
 
-    camera: FrameCamera
+    camera: FrameCameraSettings
     temporal: float
     pattern: FixedPattern
-    remaining: tuple[float, float]
+    remaining: dict[str, float]
 
 
-def fit_frame_noise(capture_set: CaptureSet, model: NDArray, start: FrameCamera) -> FrameNoise:
+def fit_frame_noise(capture_set: CaptureSet, model: NDArray, start: FrameCameraSettings) -> FrameNoise:
     """Fit full well, read noise and fixed pattern to the residual of the frames.
 
     The variance of the temporal noise is a line over the signal (photon transfer, EMVA 1288): its slope is the
     digital number an electron makes, its intercept read noise and rounding. The noise comes from second
     differences of the residual in time, the pattern from second differences over the sensor, so that a smooth
     misfit of the model takes no part. The black level is taken as 0: frames cannot tell it from ambient light.
+    Of logarithmic frames, which are linear by now, noise and pattern are shares of the light.
 
     Args:
         capture_set: The captures.
         model: Predicted frames, white levels, [N, H, W], in the order of `capture_set.frames()`.
-        start: Camera whose other settings are kept.
+        start: Camera whose other settings are kept, where it is of the captures' kind.
     """
-    peak = float(capture_set.peak)
+    about, peak = capture_set.captures[0].info.camera, float(capture_set.peak)
     frames = capture_set.frames().astype(np.float64)
     signal = model.astype(np.float64) * peak
     residual = frames - signal
@@ -250,29 +248,51 @@ def fit_frame_noise(capture_set: CaptureSet, model: NDArray, start: FrameCamera)
     swing = signal - mean_signal
     power = np.maximum((swing**2).sum(axis=0), 1e-9)
     tilt = (swing * residual).sum(axis=0) / power  # a of residual = a signal + b, for each pixel
-    noise, level = _temporal(residual - tilt * swing, signal, capture_set.frame_of())
+    seen = signal if about.log is None else frames  # with the pattern, which the noise of log frames grows with
+    noise, level = _temporal(residual - tilt * swing, seen, capture_set.frame_of())
     open_ = level < _OPEN * peak
     noise, level = noise[open_], level[open_]
+    temporal = float(np.sqrt(np.mean(noise**2)))
+    prnu, dsnu = _fixed_pattern(residual.mean(axis=0), mean_signal, tilt, power, temporal**2, len(frames))
+    pattern, (left, offset_left) = most_probable_pattern(residual, signal, temporal, prnu, dsnu, peak)
+    if about.log is not None:
+        rms = math.sqrt(float(np.mean(signal**2)))
+        spread, rest = (
+            about.log.codes_per_efold * math.hypot(a, b / rms) for a, b in ((prnu, dsnu), (left, offset_left))
+        )
+        share = math.sqrt(float(np.sum(noise**2) / np.sum(level**2)))
+        camera = _log_camera(about.log, frames[0], share, spread)
+        return FrameNoise(camera, temporal / peak, pattern, {"pattern_codes": rest})
     slope, floor = _photon_transfer(noise, level)
     full_well = min(_LARGEST_WELL_E, peak / slope) if slope > 0 else _LARGEST_WELL_E
     dn_per_e = peak / full_well
-    read_e = math.sqrt(max(floor - 1 / 12, 0.0)) / dn_per_e
-    temporal = float(np.sqrt(np.mean(noise**2)))
-    prnu, dsnu = _fixed_pattern(residual.mean(axis=0), mean_signal, tilt, power, temporal**2, len(frames))
-    exposure = capture_set.captures[0].info.camera.exposure_s
+    start = start if isinstance(start, FrameCamera) else FrameCamera()
     camera = replace(
         start,
-        exposure_s=start.exposure_s if exposure is None else exposure,
+        exposure_s=start.exposure_s if about.exposure_s is None else about.exposure_s,
         full_well_e=full_well,
-        read_noise_e=read_e,
+        read_noise_e=math.sqrt(max(floor - 1 / 12, 0.0)) / dn_per_e,
         prnu=prnu,
         dsnu_e=dsnu / dn_per_e,
         bit_depth=int(peak + 1).bit_length() - 1,
         gain=1.0,
         black_level=0.0,
     )
-    pattern, (left, offset_left) = most_probable_pattern(residual, signal, temporal, prnu, dsnu, peak)
-    return FrameNoise(camera, temporal / peak, pattern, (left, offset_left / dn_per_e))
+    return FrameNoise(camera, temporal / peak, pattern, {"prnu": left, "dsnu_e": offset_left / dn_per_e})
+
+
+def _log_camera(codes: LogCodes, frame: NDArray, share: float, spread: float) -> LogFrameCamera:
+    """Return the camera of log frames whose noise is a share of the light, of which the rounding makes some.
+
+    Args:
+        codes: Its codes.
+        frame: A frame, linear [H, W]: codes of 8 bits leave few numbers.
+        share: Noise over light.
+        spread: Standard deviation of the fixed pattern, codes.
+    """
+    bits = 8 if np.isin(frame, codes.levels(np.arange(256, dtype=np.uint8))).all() else 12
+    noise = math.sqrt(max((codes.codes_per_efold * share) ** 2 - 4.0 ** (12 - bits) / 12, 0.0))
+    return LogFrameCamera(codes.codes_per_efold, codes.white_code, 255.0, 0.0, spread, 0.0, 0.0, noise, bits)
 
 
 def most_probable_pattern(
@@ -363,35 +383,3 @@ def local_square(image: NDArray) -> NDArray[np.float64]:
     padded = np.pad(np.asarray(image, dtype=np.float64), 1, mode="reflect", reflect_type="odd")
     around = padded[1:-1, :-2] + padded[1:-1, 2:] + padded[:-2, 1:-1] + padded[2:, 1:-1]
     return (2 * padded[1:-1, 1:-1] - around / 2) ** 2 / 5
-
-
-def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
-    """Return by how much the variance of the frames' noise is to be raised when they are solved for a target.
-
-    What a light path gets wrong moves with the target, so that it does not average over frames and pixels, as
-    noise does. Frames whose noise alone counts are believed in what they do not tell. The factor is the one at
-    which the best linear estimate of the targets of captures held out has the least squared error.
-
-    Args:
-        held: Captures with known targets, which the light path was not fitted to.
-        setup: The fitted setup, linear.
-        noise: The frame camera's noise and pattern.
-    """
-    grid = (min(held.shape[0], _GRID[0]), min(held.shape[1], _GRID[1]))
-    together = held.shape[0] * held.shape[1] / (grid[0] * grid[1])  # pixels whose mean is one of the grid
-    plane = Plane(_CELLS, _CELLS, held.target_size_m / _CELLS)
-    prior = handwritten_prior(plane, ink=Ink.of(scene.target for scene in held.scenes))
-    errors, lights = np.zeros(len(FACTORS)), SequenceLights()
-    for k, (capture, scene) in enumerate(zip(held.captures, held.scenes, strict=True)):
-        times_s = held.times_s(k)
-        span_s = (float(times_s[0]), float(times_s[-1]))
-        light = lights.of(setup, prior, scene.motion, span_s, grid)
-        frames = noise.pattern.correct(capture.frames, held.peak)
-        values = np.asarray(reduce_by_area(frames, grid), np.float64).reshape(len(frames), -1)
-        told = FrameTerm(light, values, times_s, noise.camera, known_pattern=True).normal
-        truth = scene.target.rasterise(plane)
-        for n, factor in enumerate(FACTORS):
-            information = told.information * (together / factor)
-            z: Any = np.linalg.solve(np.eye(prior.count) + information, told.score * (together / factor))
-            errors[n] += float(np.square(prior.image(z) - truth).sum())
-    return FACTORS[int(errors.argmin())]

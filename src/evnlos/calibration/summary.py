@@ -17,6 +17,7 @@ from evnlos.calibration.captures import Calibration
 from evnlos.calibration.event_fit import EVENT_RESIDUALS, Row, event_warnings, pixel_rows, went
 from evnlos.calibration.event_statistics import write_event_errors
 from evnlos.calibration.fit import SetupFit, fit_setup
+from evnlos.calibration.frame_model import FITTED
 from evnlos.calibration.transport_fit import Residual, values_of
 from evnlos.config import save_yaml
 from evnlos.data import captures_in, randomized
@@ -25,7 +26,7 @@ from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError, MissingDependencyError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, silent
-from evnlos.registry import __version__
+from evnlos.registry import __version__, kind_of
 from evnlos.scene import HandwritingGlyphs, find_font
 from evnlos.scene.handwriting import FACES
 from evnlos.setups import CALIBRATED_FILE, TRAINING_FILE
@@ -70,16 +71,14 @@ def rows_of(fit: SetupFit, start_pixel: Any, start_camera: Any) -> list[Row]:
         Row(f"setup.ambient_gradient.{k}", first.ambient_gradient[k], last.ambient_gradient[k], None, "")
         for k in range(2)
     ]
-    camera = fit.noise.camera
-    units = {"full_well_e": "electrons", "read_noise_e": "electrons", "prnu": "", "dsnu_e": "electrons"}
+    camera, units = fit.noise.camera, FITTED[kind_of(fit.noise.camera)]
+    start_camera = start_camera if kind_of(start_camera) == kind_of(camera) else type(camera)()
     rows += [
         Row(f"setup.frame_camera.{name}", getattr(start_camera, name), getattr(camera, name), None, unit)
         for name, unit in units.items()
     ]
-    left = zip(("prnu", "dsnu_e"), fit.noise.remaining, strict=True)
-    rows += [
-        Row(f"{name} after correction", getattr(camera, name), value, None, units[name]) for name, value in left
-    ]
+    left = fit.noise.remaining
+    rows += [Row(f"{n} after correction", getattr(camera, n), left[n], None, units[n]) for n in left]
     return rows if fit.pixel is None else rows + pixel_rows(fit.pixel, start_pixel)
 
 

@@ -1,6 +1,7 @@
 """The search for a wall: a scan over cameras and plain walls, then refinement of the best few.
 
 - From captures to a fitted setup: search, what the search leaves, and the setup's files.
+- How far its frames are to be doubted, from targets of captures held out.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Array, CaptureSet, WallData, wall_data
+from evnlos.calibration.frame_model import FrameNoise
 from evnlos.calibration.transport_fit import TransportFit
 from evnlos.calibration.wall_fit import (
     FREEDOMS,
@@ -30,9 +33,12 @@ from evnlos.calibration.wall_fit import (
     uncertainty,
 )
 from evnlos.calibration.wall_rest import WallRest, rest_of
+from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse import FrameTerm, SequenceLights, handwritten_prior
 from evnlos.machine import note
 from evnlos.optics.facets import Pose
+from evnlos.scene import Ink
 from evnlos.setups import FittedSetup, SensorSize, Setup
 from evnlos.setups.files import WALL_FILE, AboutWall, FittedWall, write_fitted
 from evnlos.types import Plane
@@ -315,3 +321,40 @@ def _plain(state: WallState, plane: Plane, shape: tuple[int, int]) -> FittedWall
     about = AboutWall(table.scale, table.step, table.matte, Plane(1, 1, 0.01), plane)
     empty = np.zeros((0, *shape), np.float32), np.zeros((0, plane.height * plane.width), np.float32)
     return FittedWall(table.log_density, one, one, np.zeros((1, 1), np.float32), *empty, about)
+
+
+FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+"""By how much the variance of the frames' noise may be raised."""
+_GRID, _CELLS = (50, 80), 32  # pixels on which captures are solved, and cells of the target
+
+
+def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
+    """Return by how much the variance of the frames' noise is to be raised when they are solved for a target.
+
+    What a light path gets wrong moves with the target, so that it does not average over frames and pixels, as
+    noise does. Frames whose noise alone counts are believed in what they do not tell. The factor is the one at
+    which the best linear estimate of the targets of captures held out has the least squared error.
+
+    Args:
+        held: Captures with known targets, which the light path was not fitted to.
+        setup: The fitted setup, linear.
+        noise: The frame camera's noise and pattern.
+    """
+    grid = (min(held.shape[0], _GRID[0]), min(held.shape[1], _GRID[1]))
+    together = held.shape[0] * held.shape[1] / (grid[0] * grid[1])  # pixels whose mean is one of the grid
+    plane = Plane(_CELLS, _CELLS, held.target_size_m / _CELLS)
+    prior = handwritten_prior(plane, ink=Ink.of(scene.target for scene in held.scenes))
+    errors, lights = np.zeros(len(FACTORS)), SequenceLights()
+    for k, (capture, scene) in enumerate(zip(held.captures, held.scenes, strict=True)):
+        times_s = held.times_s(k)
+        span_s = (float(times_s[0]), float(times_s[-1]))
+        light = lights.of(setup, prior, scene.motion, span_s, grid)
+        frames = noise.pattern.correct(capture.frames, held.peak)
+        values = np.asarray(reduce_by_area(frames, grid), np.float64).reshape(len(frames), -1)
+        told = FrameTerm(light, values, times_s, noise.camera, known_pattern=True).normal
+        truth = scene.target.rasterise(plane)
+        for n, factor in enumerate(FACTORS):
+            information = told.information * (together / factor)
+            z: Any = np.linalg.solve(np.eye(prior.count) + information, told.score * (together / factor))
+            errors[n] += float(np.square(prior.image(z) - truth).sum())
+    return FACTORS[int(errors.argmin())]

@@ -2,8 +2,15 @@
 
 from evnlos.cameras.event_camera import EventCamera, EventStream, simulate_events
 from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, PixelSettings
-from evnlos.cameras.frame_camera import FrameCamera, colour_filters, mosaicked, of_mosaic
-from evnlos.cameras.pixel import EventPixel, V2ePixel
+from evnlos.cameras.frame_camera import (
+    FrameCamera,
+    FrameCameraSettings,
+    LogFrameCamera,
+    colour_filters,
+    mosaicked,
+    of_mosaic,
+)
+from evnlos.cameras.pixel import EventPixel, LogCodes, V2ePixel
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.circuit import CircuitPixel
 from evnlos.cameras.pixels.readout import FlickeringWall, ReadoutPixel
@@ -22,6 +29,9 @@ __all__ = [
     "EventStream",
     "FlickeringWall",
     "FrameCamera",
+    "FrameCameraSettings",
+    "LogCodes",
+    "LogFrameCamera",
     "PixelSettings",
     "ReadoutPixel",
     "V2ePixel",

@@ -1,10 +1,16 @@
-"""The settings of v2e's pixel: solved in continuous time (`EventPixel`), or frame by frame (`V2ePixel`)."""
+"""The settings of v2e's pixel: solved in continuous time (`EventPixel`), or frame by frame (`V2ePixel`).
+
+- The codes of pixels whose log light is read out: what makes them, and the light that they stand for.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
@@ -19,7 +25,8 @@ from evnlos.cameras.event_model import (
     check_phase,
     require,
 )
-from evnlos.errors import ConfigError
+from evnlos.cameras.streams import WHITE_DN
+from evnlos.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from evnlos.cameras.pixels.continuous_math import Curve
@@ -283,3 +290,107 @@ def continuous(pixel: PixelSettings) -> EventPixel:
     if not isinstance(pixel, EventPixel):
         raise ConfigError(f"the pixel is of kind {getattr(pixel, 'kind', '?')!r}; this needs kind continuous")
     return pixel
+
+
+LOG_WHITE = 4095
+"""Largest code of a logarithmic pixel."""
+
+
+@dataclass(frozen=True)
+class LogCodes:
+    """Codes of logarithmic pixels: a code y of 12 bits is of the light exp((y - white_code) / codes_per_efold).
+
+    Codes of 8 bits lack the lower four: y = 16 code + 7.5, the middle of what they stand for.
+
+    Args:
+        codes_per_efold: Codes of 12 bits per log unit of light.
+        white_code: Code of 12 bits that white light, 1.0, has.
+
+    Raises:
+        ConfigError: A value outside its range.
+
+    Example:
+        >>> LogCodes(600.0, 2916.0).light(np.array([2916, 2316], np.uint16)).round(4).tolist()
+        [1.0, 0.3679]
+    """
+
+    codes_per_efold: float
+    """Codes of 12 bits per log unit (e-fold) of light, of files of 8 bits, too."""
+    white_code: float
+    """Code of 12 bits that counts as white; what is brighter is clipped."""
+
+    def __post_init__(self) -> None:
+        require(self, "codes_per_efold", 10.0, 1e5, "codes of 12 bits per log unit of light")
+        require(self, "white_code", 1.0, LOG_WHITE, "of the 4096 codes of 12 bits")
+
+    def light(self, codes: ArrayLike) -> NDArray[np.float64]:
+        """Return the light that codes stand for, 1.0 = white, not clipped.
+
+        Args:
+            codes: uint8 for codes of 8 bits, else codes of 12 bits, [...].
+        """
+        codes = np.asarray(codes)
+        fine = codes * 16.0 + 7.5 if codes.dtype == np.uint8 else codes
+        return np.exp((fine - self.white_code) / self.codes_per_efold)
+
+    def levels(self, frames: NDArray, what: str = "") -> NDArray[np.uint16]:
+        """Return frames as numbers that are proportional to light, 65535 = white; clipped there.
+
+        Args:
+            frames: Codes, uint8 (8 bits) or uint16 (12 bits) [...].
+            what: What they were read from, for a message.
+
+        Raises:
+            DataError: A code of more than 12 bits.
+        """
+        count = 256 if frames.dtype == np.uint8 else LOG_WHITE + 1
+        if frames.size and (largest := int(frames.max())) >= count:
+            raise DataError(
+                f"{what}a log frame holds the code {largest}; codes of 12 bits end at {LOG_WHITE}: save them "
+                "unscaled, or leave camera.log out where the frames are linear"
+            )
+        light = np.minimum(self.light(np.arange(count).astype(frames.dtype)), 1.0)
+        return np.rint(light * 65_535).astype(np.uint16)[frames]
+
+
+class LogResponse:
+    """Base of what turns log light into codes with a fixed pattern, by the equation of `CelexCamera`."""
+
+    codes_per_efold: float
+    mid_code: float
+    mid_dn: float
+    gain_mismatch: float
+    pattern_codes: float
+    row_codes: float
+    column_codes: float
+    noise_codes: float
+
+    @property
+    def codes(self) -> LogCodes:
+        """What the codes mean, but for the fixed pattern."""
+        white = self.mid_code + self.codes_per_efold * math.log(WHITE_DN / self.mid_dn)
+        return LogCodes(self.codes_per_efold, white)
+
+    def _check_response(self) -> None:
+        for name in ("codes_per_efold", "mid_dn"):
+            require(self, name, 1e-6, 1e6, "(positive)")
+        for name in ("gain_mismatch", "pattern_codes", "row_codes", "column_codes", "noise_codes"):
+            require(self, name, 0.0, 4096.0, "(0 switches it off)")
+        require(self, "mid_code", -1e6, 1e6, "digital numbers of 12 bits")
+
+    def _pattern(self, shape: tuple[int, int], seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gain 1 + g, and f + r + c in codes of 12 bits, [H, W] each."""
+        draw = np.random.default_rng([seed, 3])
+        gain = 1.0 + self.gain_mismatch * draw.standard_normal(shape)
+        offset = self.pattern_codes * draw.standard_normal(shape)
+        offset += self.row_codes * draw.standard_normal((shape[0], 1))
+        offset += self.column_codes * draw.standard_normal((1, shape[1]))
+        return gain, offset
+
+    def _values(
+        self, level: NDArray, place: NDArray | slice, noise: NDArray, pattern: tuple[NDArray, NDArray]
+    ) -> NDArray[np.uint16]:
+        """Return the codes of pixels `place` at log levels [N], ln DN, with normal random numbers [N]."""
+        gain, offset = (part.ravel()[place] for part in pattern)
+        value = self.mid_code + self.codes_per_efold * gain * (level - math.log(self.mid_dn)) + offset
+        return np.clip(np.rint(value + self.noise_codes * noise), 0, LOG_WHITE).astype(np.uint16)

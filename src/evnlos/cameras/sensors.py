@@ -31,8 +31,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, LogCurve, PixelSettings, require
-from evnlos.cameras.pixel import EventPixel, continuous
+from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, LogCurve, PixelSettings
+from evnlos.cameras.pixel import EventPixel, LogResponse, continuous
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.readout import LogLevel, ReadoutPixel, ValuesArray
 from evnlos.cameras.random_numbers import check_seed
@@ -170,10 +170,6 @@ def _cutoff(latency_s: float) -> float:
     return round(1.0 / (2.0 * math.pi * latency_s), 1)
 
 
-WHITE = 4095
-"""Largest value of a pixel."""
-
-
 class CelexRecording(NamedTuple):
     """Events as the camera's software gives them, and what it does not know."""
 
@@ -191,7 +187,7 @@ def _pixels() -> ReadoutPixel:
 
 
 @dataclass(frozen=True)
-class CelexCamera:
+class CelexCamera(LogResponse):
     """Logarithmic pixels that are read in two ways: events with 12-bit values (EI), and frames (F).
 
     Args:
@@ -237,11 +233,7 @@ class CelexCamera:
     """Seed of the fixed pattern."""
 
     def __post_init__(self) -> None:
-        for name in ("codes_per_efold", "mid_dn"):
-            require(self, name, 1e-6, 1e6, "(positive)")
-        for name in ("gain_mismatch", "pattern_codes", "row_codes", "column_codes", "noise_codes"):
-            require(self, name, 0.0, 4096.0, "(0 switches it off)")
-        require(self, "mid_code", -1e6, 1e6, "digital numbers of 12 bits")
+        self._check_response()
         check_seed(self.pattern_seed)
         if self._photoreceptor.logarithm != "true":
             raise ConfigError('CelexCamera.pixel is lin-log; give an EventPixel with logarithm="true"')
@@ -319,12 +311,7 @@ class CelexCamera:
         Args:
             shape: Sensor size (height, width), pixels.
         """
-        draw = np.random.default_rng([self.pattern_seed, 3])
-        gain = 1.0 + self.gain_mismatch * draw.standard_normal(shape)
-        offset = self.pattern_codes * draw.standard_normal(shape)
-        offset += self.row_codes * draw.standard_normal((shape[0], 1))
-        offset += self.column_codes * draw.standard_normal((1, shape[1]))
-        return gain, offset
+        return self._pattern(shape, self.pattern_seed)
 
     def model(self, array: EventModel, shape: tuple[int, int], seed: int) -> ValuesArray:
         """Return an array of the camera's event pixels with the software behind it.
@@ -335,14 +322,6 @@ class CelexCamera:
             seed: Seed of the values' noise.
         """
         return ValuesArray(array, self._photoreceptor, partial(self._values, pattern=self.pattern(shape)), seed)
-
-    def _values(
-        self, level: NDArray, place: NDArray | slice, noise: NDArray, pattern: tuple[NDArray, NDArray]
-    ) -> NDArray[np.uint16]:
-        """Return the values of pixels `place` at log levels [N], with normal random numbers [N]."""
-        gain, offset = (part.ravel()[place] for part in pattern)
-        value = self.mid_code + self.codes_per_efold * gain * (level - math.log(self.mid_dn)) + offset
-        return np.clip(np.rint(value + self.noise_codes * noise), 0, WHITE).astype(np.uint16)
 
 
 @EVENT_MODELS.register

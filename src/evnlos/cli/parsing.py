@@ -347,7 +347,7 @@ def flag_value(words: list[str], flag: str) -> str | None:
     """Return the value of a flag, given as `--flag value` or `--flag=value`; None where it is not given."""
     for word, following in zip(words, [*words[1:], None], strict=False):
         name, equals, value = word.partition("=")
-        if name == flag and (equals or following is not None):
+        if name.replace("_", "-") == flag.replace("_", "-") and (equals or following is not None):
             return value if equals else following
     return None
 

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evnlos.data.capture import Capture
 from evnlos.data.capture_info import CaptureInfo
 from evnlos.data.clocks import FEWEST_LAGS, LEAST_AGREEMENT, beside_others, find_lag
-from evnlos.data.fixed_pattern import light_path, unlike_neighbours
+from evnlos.data.fixed_pattern import light_path
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import find_hot_pixels
@@ -89,9 +90,13 @@ def _light(capture: Capture) -> Iterator[Finding]:
         found = f"the largest of 16 bits is {int(frames.max())}: these look like {bits} bits, not scaled"
         cure = f"state camera: {{white_dn: {(1 << bits) - 1}}} in capture.yaml, beside its other keys"
         yield Finding("white level", "doubtful", found, cure)
-    clipped = float((frames >= peak).mean())
+    clipped, log = float((frames >= peak).mean()), capture.info.camera.log
+    if log is None and Path(capture.info.frames or "").suffix == ".bin":
+        cure = "state camera: {log: {codes_per_efold: 600, white_code: 2916}}, or what your sensor has"
+        yield Finding("response", "bad", "frames of a CeleX-V are logarithmic, and are read as linear", cure)
     found = f"{100 * clipped:.2f} % of the frames' pixels are clipped"
-    cure = "shorten the exposure, close the aperture, or dim the ambient light"
+    cure = "shorten the exposure, close the aperture" if log is None else "raise white_code of camera.log"
+    cure += ", or dim the ambient light"
     yield _finding("saturation", clipped < 1e-3, clipped < 0.02, found, cure)
     share = float(np.median(frames) / peak)
     least = _DARK_DN * (257 if capture.info.camera.mosaic and peak > 255 else 1)  # 8 bits became 16
@@ -99,20 +104,18 @@ def _light(capture: Capture) -> Iterator[Finding]:
     found = f"{at}; {100 * dark:.0f} % are darker than {least + 1} digital numbers"
     cure = "lengthen the exposure, open the aperture, or bring the wall nearer"
     yield _finding("brightness", dark < 0.05, dark < 0.5, found, cure)
-    if capture.info.camera.mosaic is None and (unlike := unlike_neighbours(frames)) > _MOSAIC:
+    if capture.info.camera.mosaic is None and (unlike := _unlike_neighbours(frames)) > _MOSAIC:
         found = (
             f"pixels of a 2 x 2 square differ by {100 * unlike:.0f} %, as raw values behind colour filters do"
         )
-        cure = (
-            f"state camera.mosaic in capture.yaml, e.g. rggb; it is {capture.info.camera.mosaic or 'left out'}"
-        )
+        cure = "state camera.mosaic in capture.yaml, e.g. rggb; it is left out"
         yield Finding("colour filters", "bad", found, cure)
 
 
 def _unscaled_bits(capture: Capture) -> int | None:
     """Return 10, 12 or 14 where images of 16 bits, as they lie in their files, hold no more than that."""
     info, frames = capture.info, capture.frames
-    changes = info.dark, info.flat, info.registration, info.camera.mosaic, info.camera.white_dn
+    changes = info.dark, info.flat, info.registration, info.camera.mosaic, info.camera.white_dn, info.camera.log
     size = (info.camera.height, info.camera.width) if info.roi is None else (info.roi.height, info.roi.width)
     is_raw = Path(info.frames or "").suffix in ("", ".csv", ".npy") and frames.shape[1:] == size
     if frames.dtype != np.uint16 or not is_raw or any(one is not None for one in changes):
@@ -120,6 +123,19 @@ def _unscaled_bits(capture: Capture) -> int | None:
     if np.gcd.reduce(np.unique(frames[0])) > 1:  # of fewer bits, but scaled
         return None
     return next((bits for bits in (10, 12, 14) if 255 < int(frames.max()) < 1 << bits), None)
+
+
+def _unlike_neighbours(frames: NDArray) -> float:
+    """Return by how much the diagonals of squares of 2 x 2 pixels differ over the sensor, share of the mean.
+
+    Behind Bayer filters one is green and the other red and blue; light that grows evenly has the same on both.
+    """
+    rows, columns = (side // 2 * 2 for side in frames.shape[1:])
+    if not rows or not columns:
+        return 0.0
+    mean = frames[:, :rows, :columns].mean(axis=0, dtype=np.float64)
+    (a, b), (c, d) = mean.reshape(rows // 2, 2, columns // 2, 2).mean(axis=(0, 2))
+    return float(abs(a + d - b - c) / max(a + b + c + d, 2.0)) * 2
 
 
 def _movement(capture: Capture) -> Iterator[Finding]:

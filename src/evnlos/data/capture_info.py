@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from evnlos.cameras import LogCodes
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.events.files.registry import find_format
@@ -44,6 +45,8 @@ class CameraInfo:
     """Colour filters on the pixels of the event camera, as `mosaic`; null where each sees all of the light."""
     white_dn: int | None = None
     """Digital number of white in files of 16 bits (frames, dark, flat), 4095 for 12 bits; null is 65535."""
+    log: LogCodes | None = None
+    """Codes of frames of logarithmic pixels (CeleX-V, mode F); null where their numbers grow as the light."""
 
     def __post_init__(self) -> None:
         sides = f"camera is {self.width} x {self.height} pixels"
@@ -59,8 +62,8 @@ class CameraInfo:
     @property
     def balance(self) -> float:
         """What a white target has in the frames as they are used, over what it has as grey (Rec. 601)."""
-        white = self.white_balance or (1.0, 1.0, 1.0)
-        return 1.0 if self.colour is None else balances(white)[COLOURS.index(self.colour)]
+        whole = [1.0] if self.colour is None else balances(self.white_balance or (1.0, 1.0, 1.0))
+        return whole[COLOURS.index(self.colour) if self.colour else 0]
 
 
 def balances(white: tuple[float, float, float]) -> list[float]:
@@ -266,6 +269,10 @@ class CaptureInfo:
             raise ConfigError(f"every is {self.every}; give 1 (all rows and columns) to {_MOST_EVERY}")
         if self.events is None and self.alignment != AlignmentInfo():
             raise ConfigError("alignment is to the events' clock, and events is null; leave alignment out")
+        linear = {f"camera.{name}": getattr(self.camera, name) for name in ("mosaic", "colour", "white_dn")}
+        for name, value in (linear | {"dark": self.dark}).items() if self.camera.log is not None else ():
+            if value is not None:
+                raise ConfigError(f"{name} is {value}, and camera.log is of grey codes; leave one of them out")
         z_m = self.setup.get("distance_m")
         if z_m is not None and (type(z_m) not in (int, float) or not 0 < z_m < math.inf):
             raise ConfigError(f"setup.distance_m is {z_m!r}; give a finite number of metres above 0, or null")
@@ -342,23 +349,15 @@ CAMERAS = {
 """Cameras by name: maker and model, columns and rows of the sensor, the usual names of events and frames."""
 
 
-def begin_capture(
-    folder: str | Path,
-    width: int,
-    height: int,
-    name: str = "my camera",
-    events: str = "events.raw",
-    frames: str = "frames",
-) -> Path:
+def begin_capture(folder: str | Path, width: int, height: int, name: str = "my camera", *files: str) -> Path:
     """Write a commented `capture.yaml` into a new or empty folder and return its path.
 
     Args:
         folder: The folder of the capture.
         width: Columns of the event camera's sensor, pixels.
         height: Rows, pixels.
-        name: Maker and model.
-        events: File of the events.
-        frames: File or folder of the frames.
+        name: Maker and model; the frames of a CeleX-V are logarithmic.
+        files: File of the events, and file or folder of the frames; by default events.raw and frames.
 
     Raises:
         DataError: The folder has a capture.yaml already, or is a file; or the size is none.
@@ -370,9 +369,10 @@ def begin_capture(
         raise DataError(f"{path} exists; edit it, or give another folder")
     if width < 1 or height < 1:
         raise DataError(f"the sensor is {width} x {height} pixels; give its width and height")
-    words = {"name": " ".join(name.replace(":", " ").split()), "width": width, "height": height}
+    words = {"width": width, "height": height, "linear": "" if name == CAMERAS["celex-v"][0] else "# "}
+    words["events"], words["frames"] = files or ("events.raw", "frames")
     template = Path(__file__).with_name("capture_template.yaml").read_text(encoding="utf-8")
-    write_atomically(path, template.format(**words, events=events, frames=frames).encode())
+    write_atomically(path, template.format(**words, name=" ".join(name.replace(":", " ").split())).encode())
     return path
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -135,13 +136,19 @@ def warp_frames(
 
 def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
     """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
-    frames, notes, white = series.images, [], info.camera.white_dn
+    frames, notes, white, log = series.images, list[str](), info.camera.white_dn, info.camera.log
+    if log is not None:
+        frames = mapped(frames, partial(log.levels, what=f"{folder}: "))
+        notes.append(
+            f"log frames made linear: {log.codes_per_efold:g} codes per e-fold, {log.white_code:g} white"
+        )
     size = frames.shape[1:]
     if white is not None and frames.dtype == np.uint8:
         raise DataError(f"{folder}: camera.white_dn is {white}, and frames have 8 bits; leave it out")
     peak = float(white or np.iinfo(frames.dtype).max)
     filters = size, info.camera.colour, info.camera.mosaic
     dark, flat = (read_image(inside(folder, one), *filters) if one else None for one in (info.dark, info.flat))
+    flat = log.levels(flat, f"{folder}: ") if log is not None and flat is not None else flat
     is_corrected = dark is not None or flat is not None
     if white is not None:
         notes.append(f"frames scaled: white is {white}")
@@ -232,22 +239,6 @@ def own_pixels(info: CaptureInfo, colour: Colour, kind: Literal["frames", "event
     if not seen.any():
         raise ConfigError(f"no pixel for {colour} among every {side} rows and columns; state an odd `every`")
     return seen
-
-
-def unlike_neighbours(frames: NDArray) -> float:
-    """Return by how much the diagonals of squares of 2 x 2 pixels differ over the sensor, share of the mean.
-
-    Behind Bayer filters one is green and the other red and blue; light that grows evenly has the same on both.
-
-    Args:
-        frames: Digital numbers [N, H, W].
-    """
-    rows, columns = (side // 2 * 2 for side in frames.shape[1:])
-    if not rows or not columns:
-        return 0.0
-    mean = frames[:, :rows, :columns].mean(axis=0, dtype=np.float64)
-    (a, b), (c, d) = mean.reshape(rows // 2, 2, columns // 2, 2).mean(axis=(0, 2))
-    return float(abs(a + d - b - c) / max(a + b + c + d, 2.0)) * 2
 
 
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less

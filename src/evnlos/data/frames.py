@@ -167,8 +167,8 @@ def _at_rate(path: Path, count: int, info: CaptureInfo) -> NDArray[np.int64]:
     return np.round(np.arange(count) * (1e6 / _rate(path, info))).astype(np.int64)
 
 
-def _video_frames(folder: Path, path: Path, info: CaptureInfo, most: int | None) -> FrameReader:
-    """Return what reads a video, animation, array or folder of images as 16 bits."""
+def _video_frames(folder: Path, path: Path, info: CaptureInfo, room: int | None) -> FrameReader:
+    """Return what reads a video, animation, array or folder of images as 16 bits, in `room` bytes."""
     if path.is_dir():
         for one in path.iterdir():
             inside(folder, str(one.relative_to(folder.resolve())), f"{info.frames}")
@@ -177,14 +177,15 @@ def _video_frames(folder: Path, path: Path, info: CaptureInfo, most: int | None)
     colour = camera.colour if camera.mosaic is None else None
     cure = "save whole numbers of 16 bits, of which 65535, or camera: {white_dn: ...} in capture.yaml, is white"
     video = open_video(path, fps=None if timed else _rate(path, info), colour=colour, white_cure=cure)
-    if most is not None:
-        _check_size(path, (video.frames or 1) * video.width * video.height * 2, most)
+    if room is not None:
+        _check_size(path, (video.frames or 1) * video.width * video.height * 2, room)
+    most, kind = (255, np.uint8) if camera.log and video.white <= 255 else (65_535, np.uint16)
 
     def frames() -> Iterator[tuple[int, NDArray]]:
         for k, (time_s, light) in enumerate(video):
             if not np.isfinite(light).all():
                 raise DataError(f"{path}: frame {k} holds NaN or infinity; give finite values")
-            levels = np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16)
+            levels = np.clip(np.round(light * (most / 255)), 0, most).astype(kind)
             told = levels if camera.mosaic is None else of_mosaic(levels, camera.mosaic, camera.colour)
             yield round(time_s * 1e6), told
 

@@ -17,12 +17,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from evnlos.cameras import EventPixel, FrameCamera, V2ePixel, mosaicked
+from evnlos.cameras import EventPixel, FrameCamera, LogFrameCamera, V2ePixel, mosaicked
 from evnlos.config import check_made, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.capture_info import balances
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.sampling import character_of, mask_file, stated_targets
-from evnlos.data.simulate import check_ranges, check_sequences, sequence_bytes, varied
+from evnlos.data.simulate import check_ranges, check_sequences, ranges_around, sequence_bytes, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.files import new_folder
@@ -65,15 +65,7 @@ LIGHT = {"gain": 0.7, "ambient": 0.06, "ambient_gradient": (0.3, -0.2)}
 """Light of the lab: dimmer and less even than in the training simulator."""
 _CAMERAS = {
     "frame_camera": FrameCamera(exposure_s=0.016, full_well_e=9000.0, read_noise_e=12.0),
-    "pixel": EventPixel(
-        threshold_on=0.21,
-        threshold_off=0.24,
-        threshold_sigma=0.04,
-        cutoff_hz=40.0,
-        leak_rate_hz=0.05,
-        shot_noise_rate_hz=0.08,
-        refractory_s=0.0005,
-    ),
+    "pixel": EventPixel(0.21, 0.24, 0.04, 40.0, leak_rate_hz=0.05, shot_noise_rate_hz=0.08, refractory_s=5e-4),
 }
 
 _SKETCH = (6, 10)  # pixels
@@ -104,8 +96,8 @@ class Lab:
     frame_rate_hz: float = 5.0
     """Frames per second, hertz; a sequence of 8 s has the 40 positions of the paper."""
     setup: Setup = field(default_factory=lambda: in_the_lab(RadiometricSetup()))
-    """Wall, geometry, light and cameras; the frame camera has 8 bits, as captures have, and the event pixel is
-    on purpose not that of the training simulator."""
+    """Wall, geometry, light and cameras; a linear frame camera has 8 bits as captures have, and the event pixel
+    is on purpose not that of the training simulator."""
     spread: dict[str, tuple[float, float]] = field(default_factory=lambda: dict(SENSOR_SPREAD))
     """Settings drawn once for the setup, uniformly: dotted name -> (low, high); {} takes them as they stand."""
     seed: int = 0
@@ -124,29 +116,36 @@ class Lab:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):
             raise ConfigError(f"Lab.name is {self.name!r}; give letters, digits, '.', '_' or '-'")
         for name, unit in (("duration_s", "seconds"), ("frame_rate_hz", "hertz")):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"Lab.{name} is {getattr(self, name)}; give a positive number of {unit}")
+            if not 0 < (value := getattr(self, name)) < float("inf"):
+                raise ConfigError(f"Lab.{name} is {value}; give a positive number of {unit}")
         if self.duration_s * self.frame_rate_hz < 1:
             raise ConfigError(
                 f"Lab.duration_s is {self.duration_s} s at {self.frame_rate_hz} Hz; a sample needs two frames"
             )
-        if self.setup.frame_camera.bit_depth != 8:
-            raise ConfigError(
-                f"Lab.setup.frame_camera.bit_depth is {self.setup.frame_camera.bit_depth}; captures hold 8 bits"
-            )
+        if isinstance(camera := self.setup.frame_camera, LogFrameCamera):
+            if self.is_coloured:
+                raise ConfigError("Lab has a palette or mosaic, and frames of kind log are grey; leave one out")
+        elif camera.bit_depth != 8:
+            raise ConfigError(f"Lab.setup.frame_camera.bit_depth is {camera.bit_depth}; captures hold 8 bits")
         for one in self.palette:
             if not re.fullmatch(r"[0-9A-Fa-f]{6}", one):
                 raise ConfigError(f"Lab.palette has {one!r}; give six hexadecimal digits, such as ff8000")
         if not all(0 < one < float("inf") for one in self.white_balance):
             raise ConfigError(f"Lab.white_balance is {self.white_balance}; give three numbers above 0")
         _ = self.setup.event_camera  # refuses a step that does not fit the model
-        check_ranges(self, self.spread)
+        check_ranges(self, self.ranges)
         check_made(self)
 
     @property
     def is_coloured(self) -> bool:
         """Whether its frames are in colour."""
         return bool(self.palette) or self.mosaic is not None
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """`spread` without those of `SENSOR_SPREAD` whose settings the chosen kinds of cameras do not have."""
+        there = ranges_around(self, dict.fromkeys(self.spread, 0.0))
+        return {p: ends for p, ends in self.spread.items() if p in there or ends != SENSOR_SPREAD.get(p)}
 
     def drawn(self) -> Lab:
         """Return the lab with its sensor's settings drawn from `spread`: a function of the seed and the name.
@@ -159,9 +158,9 @@ class Lab:
         if not self.spread:
             return self
         pattern = derive_seed(self.seed, self.name, "fixed pattern")
-        camera = replace(self.setup.frame_camera, pattern_seed=pattern)
+        camera = replace(self.setup.frame_camera, pattern_seed=pattern)  # type: ignore[type-var]
         own = replace(self, setup=replace(self.setup, frame_camera=camera))
-        return replace(varied(own, self.spread, self.seed, self.name), spread={})
+        return replace(varied(own, self.ranges, self.seed, self.name), spread={})
 
 
 def lab_of(word: str | Path, lab: Lab | None = None) -> Lab:
@@ -376,7 +375,7 @@ def _render(task: tuple[Lab, str, Path]) -> Path:
 
 
 def _description(lab: Lab, name: str, scene: Scene | SeveralTargets) -> dict[str, Any]:
-    setup = lab.setup
+    setup, camera = lab.setup, lab.setup.frame_camera
     distance_m = setup.default_distance_m if lab.motion.z_m is None else lab.motion.z_m
     return {
         "camera": {
@@ -384,8 +383,9 @@ def _description(lab: Lab, name: str, scene: Scene | SeveralTargets) -> dict[str
             "width": setup.sensor.width,
             "height": setup.sensor.height,
             "frame_rate_hz": lab.frame_rate_hz,
-            "exposure_s": setup.frame_camera.exposure_s,
+            "exposure_s": camera.exposure_s,
             **{key: one for key in ("mosaic", "event_mosaic") if (one := getattr(lab, key))},
+            **({"log": to_dict(camera.codes)} if isinstance(camera, LogFrameCamera) else {}),
             **({"white_balance": list(lab.white_balance)} if lab.is_coloured or lab.event_mosaic else {}),
         },
         "events": "events.raw",

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evnlos.cameras import FrameCamera, PixelSettings
+from evnlos.cameras import FrameCameraSettings, PixelSettings
 from evnlos.config import check_made, config_hash, to_dict
 from evnlos.data.pool import Engine, processes, run_tasks
 from evnlos.data.sampling import Samples, Sampling, edges_from, make_samples
@@ -81,7 +81,7 @@ def ranges_around(config: object, spreads: Mapping[str, float]) -> Ranges:
     for path, spread in spreads.items():
         value: Any = config
         for name in path.split("."):
-            value = getattr(value, name, None)
+            value = getattr(value, name) if name in getattr(value, "__dataclass_fields__", ()) else None
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             ends = sorted((float(value) * (1 - spread), float(value) * (1 + spread)))
             ranges[path] = (ends[0], ends[1])
@@ -187,7 +187,7 @@ class Simulation:
         return replace(self, setup=replace(self.setup, **changes))
 
     @property
-    def frame_camera(self) -> FrameCamera:
+    def frame_camera(self) -> FrameCameraSettings:
         """The setup's frame camera."""
         return self.setup.frame_camera
 
@@ -250,10 +250,9 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     seed = derive_seed(config.seed, name, "events")
     events = setup.event_camera.record(wall, 0.0, drawn.duration_s, seed=seed)
     frames = setup.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
-    peak = 2**setup.frame_camera.bit_depth - 1
-    return make_samples(
-        frames, peak, events, edges_from(times_s), config.sampling, motion=scene.motion, target=scene.target
-    ), events
+    frames, known = setup.frame_camera.linear_levels(frames), {"motion": scene.motion, "target": scene.target}
+    peak = setup.frame_camera.peak
+    return make_samples(frames, peak, events, edges_from(times_s), config.sampling, **known), events
 
 
 def sequence_bytes(setup: Setup, target_size_m: float, duration_s: float, frames: int, cells: int = 0) -> int:

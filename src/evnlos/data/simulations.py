@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from evnlos.cameras import FrameCamera
 from evnlos.config import config_hash, from_dict
 from evnlos.data.pool import processes
 from evnlos.data.sampling import Sampling
@@ -85,6 +86,7 @@ _WIDE = {
     "setup.companion": 0.5,
     "setup.frame_camera.full_well_e": 0.3,
     "setup.frame_camera.read_noise_e": 0.3,
+    "setup.frame_camera.noise_codes": 0.3,
     "setup.pixel.threshold_on": 0.25,
     "setup.pixel.threshold_off": 0.25,
     "setup.pixel.threshold_sigma": 0.5,
@@ -96,8 +98,7 @@ _WIDE = {
     "setup.pixel.photocurrent_a_per_dn": 0.3,
     "setup.pixel.noise_factor": 0.5,
 }
-_WIDE_PLACE_M = 0.002
-_WIDE_SETUPS = 6
+_WIDE_PLACE_M, _WIDE_SETUPS = 0.002, 6
 
 
 def randomized(simulation: Simulation, walls: bool = True) -> Simulation:
@@ -161,12 +162,11 @@ def page() -> Simulation:
     Metal from smooth to rough, the distances, lights, noises and thresholds around the page's first setting;
     outside that range, where even the best linear image shows next to nothing, the networks are unreliable.
     """
-    setup = page_setup()
-    well_e, read_e = setup.frame_camera.full_well_e, setup.frame_camera.read_noise_e
+    well_e, read_e = FrameCamera.full_well_e, FrameCamera.read_noise_e
     return Simulation(
         glyphs=HandwritingGlyphs(characters=UPPER_CASE + DIGITS, writers=44),
         motion=LineMotion((-0.08, 0.0), 0.02),
-        setup=setup,
+        setup=page_setup(),
         sampling=Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24),
         vary={
             "setup.roughness": (0.02, 0.09),

@@ -243,7 +243,7 @@ def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
     for exposure in np.geomspace(1e-4, slowest, 10).tolist():
         blurred = light.exposed(exposure)
         for gain in _GAINS:
-            camera = replace(setup.frame_camera, exposure_s=exposure, gain=gain)
+            camera = replace(_CAMERA, bit_depth=condition.bit_depth, exposure_s=exposure, gain=gain)
             told = _of_frames(blurred, references[0], setup, camera, few)
             tried.append((prior.error(told[0]), camera))
     camera = min(tried, key=lambda one: one[0])[1]

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.cameras import FrameCamera
+from evnlos.cameras import FrameCamera, FrameCameraSettings
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import PatternPrior
@@ -354,7 +354,7 @@ class FrameTerm:
         light: SequenceLight,
         frames: Array,
         times_s: Array,
-        camera: FrameCamera,
+        camera: FrameCameraSettings,
         known_pattern: bool,
         doubt: float = 1.0,
     ) -> None:

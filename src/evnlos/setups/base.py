@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera, FrameCameraSettings, PixelSettings
 from evnlos.cameras.frame_camera import SensorSize
 from evnlos.errors import ConfigError
 from evnlos.optics import DepthTransport, LinearTransport, SeveralWall
@@ -72,7 +72,7 @@ class Setup(Kinded, ABC):
     """Relative growth of the ambient light from the middle to the right and the lower border."""
     sensor: SensorSize = field(default_factory=SensorSize)
     """Size of the sensor."""
-    frame_camera: FrameCamera = field(default_factory=FrameCamera)
+    frame_camera: FrameCameraSettings = field(default_factory=FrameCamera)
     """The frame camera."""
     pixel: PixelSettings = field(default_factory=EventPixel)
     """The event model and its parameters: kind continuous, v2e, or another that is registered."""
