@@ -41,6 +41,8 @@ THOROUGH = (
     "test_command_line.py::test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows[ascii]",
     "test_distributed.py::test_two_processes_survive_a_kill",
     "test_experiment.py::test_the_papers_simulated_experiment_runs_on_a_small_scale",
+    "test_event_likelihood.py::test_events_reach_the_bound_and_their_intervals_cover[many noise events]",
+    "test_event_likelihood.py::test_events_reach_the_bound_and_their_intervals_cover[slow noise]",
     "test_event_models.py::test_a_sensor_of_the_usual_law_keeps_it",
     "test_faults.py::test_a_killed_conversion_ends_with_the_same_bytes[.csv]",
     "test_faults.py::test_a_killed_conversion_ends_with_the_same_bytes[.h5]",

@@ -50,7 +50,8 @@ NOISY = replace(PIXEL, shot_noise_rate_hz=0.2)
 DIM = CircuitPixel(0.16, 0.2, 0.02, 3e-15, follower_a=3e-12, noise_factor=1.5, poles=1)
 SETUP = RadiometricSetup(cell_m=0.01, gain=0.8, ambient=0.08, sensor=SensorSize(20, 32), pixel=PIXEL)
 BENCH = SequenceAnalysisSettings(positions=20, counts=(20,), cells=8, crossing_noise=0.04)
-SEQUENCES, EXACT = 6, 0.003  # the error of a crossing in a pixel that has none, interpolation included
+SEQUENCES, TO_REACH_THE_BOUND = 6, 32
+EXACT = 0.003  # the error of a crossing in a pixel that has none, interpolation included
 
 
 @cache
@@ -109,29 +110,43 @@ def photographed(seed: int, camera: FrameCamera, known: bool) -> FrameTerm:
 
 
 @cache
-def estimated(seed: int, least_noise: float = EXACT) -> SequenceEstimate:
+def estimated(seed: int, least_noise: float = EXACT, pixel: PixelSettings = PIXEL) -> SequenceEstimate:
     settings = LikelihoodSettings(least_noise=least_noise)
-    return estimate_sequence(light(), prior(), PIXEL.crossing_law(40.0), recorded(seed), settings=settings)
+    law, record = pixel.crossing_law(40.0), recorded(seed, pixel)
+    return estimate_sequence(light(), prior(), law, record, settings=settings)
 
 
 def error(found: SequenceEstimate, seed: int) -> float:
     return float(np.square(found.image - prior().image(truth(seed))).mean())
 
 
-@pytest.mark.parametrize(("least_noise", "behind_db", "widest"), [(EXACT, 1.0, 1.33), (0.04, 0.0, 2.0)])
+@pytest.mark.parametrize(
+    ("pixel", "least_noise", "behind_db"),
+    [(PIXEL, EXACT, 0.5), (PIXEL, 0.04, 0.0), (NOISY, EXACT, 0.5), (DIM, 0.04, 0.5)],
+    ids=["true error", "assumed error", "many noise events", "slow noise"],
+)
 def test_events_reach_the_bound_and_their_intervals_cover(
-    least_noise: float, behind_db: float, widest: float
+    pixel: PixelSettings, least_noise: float, behind_db: float
 ) -> None:
-    """With the error that crossings have, and with a larger one that is assumed, which is too cautious."""
-    law, bench = PIXEL.crossing_law(40.0), replace(BENCH, crossing_noise=least_noise)
-    seeds = range(SEQUENCES)
-    bound = [prior().error(event_information(light(), truth(s), law, bench, seed=s)[0][0, 0]) for s in seeds]
-    found = [estimated(s, least_noise) for s in seeds]
-    reached = [error(one, s) for s, one in enumerate(found)]
-    assert 10 * np.log10(np.mean(reached) / np.mean(bound)) < behind_db
-    away = [np.abs(one.image - prior().image(truth(s))) / one.deviation for s, one in enumerate(found)]
-    assert 0.84 < np.mean(np.array(away) < 1.645) < 0.97
-    assert 0.75 < np.mean([one.expected_error for one in found]) / np.mean(reached) < widest
+    """With the error that crossings have, and with a larger one that is assumed, which is too cautious.
+
+    The mean error of so many sequences is itself known to 0.3 to 0.4 dB.
+    """
+    law, bench = pixel.crossing_law(40.0), replace(BENCH, crossing_noise=least_noise)
+    assert law is not None
+    bound, reached, expected, away = [], [], [], []
+    for seed in range(TO_REACH_THE_BOUND):
+        bound.append(prior().error(event_information(light(), truth(seed), law, bench, seed=seed)[0][0, 0]))
+        found = estimated(seed, least_noise, pixel)
+        reached.append(error(found, seed))
+        expected.append(found.expected_error)
+        away.append(np.abs(found.image - prior().image(truth(seed))) / found.deviation)
+    over, beyond = (10 * np.log10(np.mean(reached) / np.mean(one)) for one in (bound, expected))
+    covered = float(np.mean(np.array(away) < 1.645))
+    print(f"{over:.2f} dB over the bound, {beyond:.2f} dB over what is expected, {covered:.0%} covered")
+    assert over < behind_db
+    assert 0.87 < covered < 0.96
+    assert -1.25 < beyond < 0.45
 
 
 def test_nothing_is_biased() -> None:
