@@ -129,6 +129,7 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",
+    "data/frames.py",
     "events/batch.py",
     "events/files/aedat.py",
     "inverse/corner.py",

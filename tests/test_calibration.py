@@ -39,8 +39,9 @@ from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import block_counts, count_map, read_recordings, within
 from evnlos.calibration.frame_model import working_shape
 from evnlos.calibration.transport_fit import clustered_error, levenberg_marquardt, values_of
-from evnlos.calibration.wall_search import frame_doubt
+from evnlos.calibration.wall_search import curvature, frame_doubt
 from evnlos.cameras import EventPixel, FrameCamera
+from evnlos.cameras.video_files import coded
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
 from evnlos.data import SensorSize, Simulation, load_pattern, read_capture, simulate_object
@@ -556,6 +557,24 @@ def test_a_fit_at_the_noise_is_not_worse_than_its_start(fit) -> None:
         return replace(fit, residuals={**fit.residuals, "surfaces held out": left})
 
     assert after(0.84).worse == () and after(0.9).worse == ("surfaces held out",)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("as-is", 0.0), ("srgb", -0.6), ("rec709", -0.6), ("log", -1.0)]
+)
+def test_numbers_that_are_curved_over_the_light_are_told(fit, name, expected) -> None:
+    rng = np.random.default_rng(3)
+    places, spots = np.arange(48)[:, None, None], rng.uniform(8, 40, (2, 20, 30))
+    light = 0.06 + 0.4 * np.exp(-np.square((places - spots[0]) / spots[1])) * rng.uniform(0.3, 1, (20, 30))
+    light[:, :3] *= 1.5 / light[:, :3].max(axis=0)  # clipped
+    numbers = np.log(light) / 5 + 1 if name == "log" else coded(light, name)
+    numbers = np.clip(numbers + rng.normal(0, 0.003, light.shape), 0, 1)
+    bent, share = curvature(numbers, 0.7 * light)
+    assert abs(bent - expected) < 0.08 and (share > 0.5) == (expected < 0)
+    line = warnings_of(replace(fit, curved=(bent, share)))[:1]
+    assert line == [] if name == "as-is" else "camera: {tone: srgb}" in line[0] and f"({bent:+.1f};" in line[0]
+    turned = warnings_of(replace(fit, curved=(-bent, share)))
+    assert (name == "as-is") == (turned == []) and all("leave camera.tone" in one for one in turned)
 
 
 def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targets(

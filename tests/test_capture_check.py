@@ -136,7 +136,9 @@ def test_events_that_are_wrong_are_named(capture) -> None:
         width=events.width, height=events.height, **(columns | {"p": np.ones(len(events), bool)})
     )
     assert levels(replace(capture, events=one_sided))["polarity balance"] == "bad"
-    few_off = replace(one_sided, p=np.arange(len(events)) % 20 > 0)  # 95 % ON: a sensor that calibration can fit
+    few_off = replace(
+        one_sided, p=np.arange(len(events)) % 20 > 0
+    )  # 95 % ON: a sensor that calibration can fit
     assert levels(replace(capture, events=few_off))["polarity balance"] == "doubtful"
     at_one = np.sort(np.concatenate([np.arange(len(events)), np.full(len(events), 5)]))
     x, y = columns["x"][at_one].copy(), columns["y"][at_one].copy()
@@ -557,7 +559,7 @@ def test_what_a_capture_of_one_camera_lacks_is_named(one_camera, tmp_path, capsy
 def test_a_capture_without_any_camera_or_a_clock_of_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match="state one of them"):
         CaptureInfo(CameraInfo(8, 8), events=None, frames=None)
-    with pytest.raises(ConfigError, match="leave alignment out"):
+    with pytest.raises(ConfigError, match=r"events is null; leave out .* alignment"):
         CaptureInfo(CameraInfo(8, 8), events=None, alignment=AlignmentInfo(offset_us="auto"))
 
 

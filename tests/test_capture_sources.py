@@ -12,9 +12,12 @@ import yaml
 from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
+from evnlos.cameras.video_files import from_light, to_light
 from evnlos.cli import main
 from evnlos.data import Capture, FixedPattern, Sampling, read_shard
-from evnlos.data.frames import homography_from_points
+from evnlos.data.capture_info import CameraInfo
+from evnlos.data.frames import homography_from_points, read_image
+from evnlos.errors import ConfigError
 from evnlos.events import FrameStack, write_aedat4, write_celex_frames, write_events
 from evnlos.plot.preview import check_image
 from evnlos.types import Events
@@ -531,3 +534,37 @@ def test_a_capture_that_was_recorded_anew_is_not_taken_for_the_old_one(tiny_capt
     assert stop.value.code == 2 and "captures" in capsys.readouterr().err
     again = read_shard(tmp_path / "out" / "d" / "shot_A.h5")[0]
     np.testing.assert_array_equal(first.surface, again.surface)
+
+
+@pytest.mark.parametrize("tone", ["srgb", "rec709"])
+def test_frames_with_a_tone_curve_are_read_as_light(tiny_captures, tmp_path, tone) -> None:
+    plain = read_capture(tiny_captures[0], needs_events=False)
+    folder = shutil.copytree(tiny_captures[0], tmp_path / "phone")
+    named = [line.split(",")[1] for line in (folder / "frames.csv").read_text().split()[1:]]
+    for name, frame in zip(named, plain.frames, strict=True):
+        Image.fromarray(from_light(frame.astype(float), tone)).save(folder / name)
+    text = (folder / "capture.yaml").read_text()
+    (folder / "capture.yaml").write_text(text.replace("camera:\n", f"camera:\n  tone: {tone}\n", 1))
+    found = read_capture(folder, needs_events=False)
+    assert found.frames.dtype == np.uint16 and any(f"{tone} undone" in note for note in found.notes)
+    light = to_light(np.arange(256, dtype=np.uint8), tone)  # steps between codes are what rounding costs
+    off = np.abs(found.frames / 257.0 - plain.frames)
+    assert off.max() <= np.diff(light).max() / 2 + 0.01
+    coloured = np.stack([found.frames[0] >> 8] * 3, axis=-1).astype(np.uint8)
+    Image.fromarray(coloured).save(tmp_path / "grey.png")  # of grey pixels, the same in any colour
+    grey = read_image(tmp_path / "grey.png", tone=tone)
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png", colour="red", tone=tone), grey)
+    raw = dict.fromkeys(("mosaic", "white_dn"))
+    for key, value in (("mosaic", "rggb"), ("white_dn", 4095)):
+        with pytest.raises(ConfigError, match=rf"camera.tone is {tone}.*{value}.*leave one out"):
+            CameraInfo(8, 8, tone=tone, **(raw | {key: value}))
+
+
+def test_a_video_with_a_tone_curve_is_read_as_light(tiny_captures, tmp_path) -> None:
+    plain = read_capture(tiny_captures[0], needs_events=False)
+    folder = shutil.copytree(tiny_captures[0], tmp_path / "phone")
+    np.save(folder / "film.npy", from_light(plain.frames.astype(float), "srgb"))
+    text = (folder / "capture.yaml").read_text().replace("frames: frames.csv", "frames: film.npy")
+    (folder / "capture.yaml").write_text(text.replace("camera:\n", "camera:\n  tone: srgb\n", 1))
+    found = read_capture(folder, needs_events=False)
+    assert np.abs(found.frames / 257.0 - plain.frames).max() < 1.2

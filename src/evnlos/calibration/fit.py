@@ -22,7 +22,7 @@ from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
 from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
-from evnlos.calibration.wall_search import check_measured, fit_wall, frame_doubt
+from evnlos.calibration.wall_search import check_measured, curvature, fit_wall, frame_doubt
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
 from evnlos.data.simulate import Simulation, ranges_around
@@ -107,6 +107,7 @@ class SetupFit:
         frame_doubt: By how much the variance of the frames' noise is raised when they are solved for a target.
         ink: Where the known targets have their ink.
         shown: What one frame shows of a target, whatever the method; None where that is not known.
+        curved: What `curvature` says of the frames held out.
     """
 
     simulation: Simulation
@@ -124,6 +125,7 @@ class SetupFit:
     frame_doubt: float = 1.0
     ink: Ink = field(default_factory=Ink)
     shown: Shown | None = None
+    curved: tuple[float, float] = (0.0, 0.0)
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -278,6 +280,7 @@ def fit_setup(
         frame_doubt(held, optics.setup, noise) if is_any else 1.0,
         Ink.of(shown),
         Shown.by(simulation),
+        curvature(lit.numpy(), predicted["held out"].numpy()),
     )
 
 

@@ -19,6 +19,7 @@ from evnlos.calibration.event_statistics import write_event_errors
 from evnlos.calibration.fit import SetupFit, fit_setup
 from evnlos.calibration.frame_model import FITTED
 from evnlos.calibration.transport_fit import Residual, values_of
+from evnlos.calibration.wall_search import curve_warning
 from evnlos.config import save_yaml
 from evnlos.data import captures_in, randomized
 from evnlos.data.fixed_pattern import PATTERN_FILE, save_pattern
@@ -132,6 +133,7 @@ def warnings_of(fit: SetupFit) -> list[str]:
     if on_bound := fit.optics.on_bound:
         names = ", ".join(f"setup.{name} ({value:.4g})" for name, value in on_bound.items())
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
+    found += curve_warning(fit.curved)
     if fit.unexplained is not None:
         found.append(f"{_left(fit.unexplained)}; {cure}")
     if little := _little_shown(fit):

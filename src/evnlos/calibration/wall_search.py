@@ -1,7 +1,7 @@
 """The search for a wall: a scan over cameras and plain walls, then refinement of the best few.
 
 - From captures to a fitted setup: search, what the search leaves, and the setup's files.
-- How far its frames are to be doubted, from targets of captures held out.
+- How far its frames are to be doubted, from targets of captures held out, and how curved their numbers are.
 """
 
 from __future__ import annotations
@@ -331,9 +331,8 @@ _GRID, _CELLS = (50, 80), 32  # pixels on which captures are solved, and cells o
 def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
     """Return by how much the variance of the frames' noise is to be raised when they are solved for a target.
 
-    What a light path gets wrong moves with the target, so that it does not average over frames and pixels, as
-    noise does. Frames whose noise alone counts are believed in what they do not tell. The factor is the one at
-    which the best linear estimate of the targets of captures held out has the least squared error.
+    What a light path gets wrong moves with the target and does not average over frames and pixels, as noise
+    does. The factor has the least squared error of the best linear estimate of targets of captures held out.
 
     Args:
         held: Captures with known targets, which the light path was not fitted to.
@@ -346,8 +345,7 @@ def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
     prior = handwritten_prior(plane, ink=Ink.of(scene.target for scene in held.scenes))
     errors, lights = np.zeros(len(FACTORS)), SequenceLights()
     for k, (capture, scene) in enumerate(zip(held.captures, held.scenes, strict=True)):
-        times_s = held.times_s(k)
-        span_s = (float(times_s[0]), float(times_s[-1]))
+        span_s = (float((times_s := held.times_s(k))[0]), float(times_s[-1]))
         light = lights.of(setup, prior, scene.motion, span_s, grid)
         frames = noise.pattern.correct(capture.frames, held.peak)
         values = np.asarray(reduce_by_area(frames, grid), np.float64).reshape(len(frames), -1)
@@ -358,3 +356,46 @@ def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
             z: Any = np.linalg.solve(np.eye(prior.count) + information, told.score * (together / factor))
             errors[n] += float(np.square(prior.image(z) - truth).sum())
     return FACTORS[int(errors.argmin())]
+
+
+_BENT, _BENT_SHARE = 0.3, 0.05  # curvature, and share of the misfit that it explains, beyond which it is told
+
+
+def curvature(frames: NDArray, light: NDArray) -> tuple[float, float]:
+    """Return how curved a camera's numbers are over light, and the share of the misfit that this explains.
+
+    Of numbers y = g(E) it is c = E g'' / g': 0 of a linear camera, about -0.6 of sRGB, -1 of a logarithm. What
+    a line of slope k leaves of a pixel's y is c k / (2 E) times what it leaves of (E - mean)^2. The half of the
+    pixels whose light changes most count, as far as nothing of them is clipped.
+
+    Args:
+        frames: Numbers, 1 = white, [N, H, W].
+        light: Light that a fit expects, [N, H, W], of any unit.
+    """
+    y, e = (np.asarray(one, np.float64).reshape(len(one), -1) for one in (frames, light))
+    change, left = e - e.mean(axis=0), y - y.mean(axis=0)
+    power = np.square(change).sum(axis=0)
+    used = (power >= np.median(power)) & (power > 0) & (y.max(axis=0) < 0.98) & (e.mean(axis=0) > 0)
+    change, left, power, level = change[:, used], left[:, used], power[used], e.mean(axis=0)[used]
+    slope = (change * left).sum(axis=0) / power
+    left -= slope * change
+    square = np.square(change) - np.square(change).mean(axis=0)
+    square -= (square * change).sum(axis=0) / power * change
+    square *= slope / (2 * level)
+    found = float((square * left).sum() / max(np.square(square).sum(), 1e-30))
+    return found, found**2 * float(np.square(square).sum() / max(np.square(left).sum(), 1e-30))
+
+
+def curve_warning(found: tuple[float, float]) -> list[str]:
+    """Return what to state of frames whose numbers are curved over the light, a line; none where they are not.
+
+    Args:
+        found: What `curvature` returned.
+    """
+    if abs(bent := found[0]) < _BENT or found[1] < _BENT_SHARE:
+        return []
+    what = (
+        f"frames: their numbers are curved over the light ({bent:+.1f}; linear is 0, sRGB -0.6, a logarithm -1)"
+    )
+    cure = "state camera: {tone: srgb} in capture.yaml, or camera.log of logarithmic pixels, or record raw"
+    return [f"{what}; {cure if bent < 0 else 'leave camera.tone and camera.log out'}"]

@@ -39,7 +39,7 @@ from evnlos.types import Colour, Events, matching_paths
 from evnlos.untrusted import no_file
 
 _HELD_BYTES = 1 << 26  # frames of an import that take more are read as they are asked for
-_LATER_KEYS = "mosaic colour white_balance event_mosaic white_dn log"  # of camera, in no capture of before
+_LATER_KEYS = "mosaic colour white_balance event_mosaic white_dn log tone"  # of camera, in no capture of before
 _MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
 
 

@@ -16,8 +16,6 @@ from evnlos.files import write_atomically
 from evnlos.types import COLOURS, LUMA_601, Colour, Mosaic
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
-_MOST_EVERY = 16  # rows and columns of which one is used
-
 
 @dataclass(frozen=True)
 class CameraInfo:
@@ -47,6 +45,8 @@ class CameraInfo:
     """Digital number of white in files of 16 bits (frames, dark, flat), 4095 for 12 bits; null is 65535."""
     log: LogCodes | None = None
     """Codes of frames of logarithmic pixels (CeleX-V, mode F); null where their numbers grow as the light."""
+    tone: Literal["srgb", "rec709"] | None = None
+    """Tone curve of frames, dark and flat (phone, webcam); null where their numbers grow as the light."""
 
     def __post_init__(self) -> None:
         sides = f"camera is {self.width} x {self.height} pixels"
@@ -58,16 +58,18 @@ class CameraInfo:
             raise ConfigError(f"camera.white_balance is {self.white_balance}; give three numbers above 0")
         if self.white_dn is not None and not 256 <= self.white_dn <= 65_535:
             raise ConfigError(f"camera.white_dn is {self.white_dn}; give 256 to 65535, of frames of 16 bits")
+        if self.tone and (raw := self.mosaic or self.log or self.white_dn):
+            raise ConfigError(f"camera.tone is {self.tone}, and what is raw ({raw}) has no tone; leave one out")
 
     @property
     def balance(self) -> float:
         """What a white target has in the frames as they are used, over what it has as grey (Rec. 601)."""
-        whole = [1.0] if self.colour is None else balances(self.white_balance or (1.0, 1.0, 1.0))
-        return whole[COLOURS.index(self.colour) if self.colour else 0]
+        return 1.0 if self.colour is None else balances(self.white_balance)[COLOURS.index(self.colour)]
 
 
-def balances(white: tuple[float, float, float]) -> list[float]:
-    """Return red, green and blue of a white target over its grey, from those up to a factor."""
+def balances(white: tuple[float, float, float] | None) -> list[float]:
+    """Return red, green and blue of a white target over its grey, from those up to a factor; None is alike."""
+    white = white or (1.0, 1.0, 1.0)
     return [one * sum(LUMA_601) / sum(map(math.prod, zip(LUMA_601, white, strict=True))) for one in white]
 
 
@@ -263,12 +265,10 @@ class CaptureInfo:
     def __post_init__(self) -> None:
         if self.events is None and self.frames is None:
             raise ConfigError("events and frames are null; state one of them")
-        if self.events is None and self.camera.event_mosaic is not None:
-            raise ConfigError("camera.event_mosaic is of the events, and events is null; leave it out")
-        if self.every is not None and not 1 <= self.every <= _MOST_EVERY:
-            raise ConfigError(f"every is {self.every}; give 1 (all rows and columns) to {_MOST_EVERY}")
-        if self.events is None and self.alignment != AlignmentInfo():
-            raise ConfigError("alignment is to the events' clock, and events is null; leave alignment out")
+        if self.every is not None and not 1 <= self.every <= 16:
+            raise ConfigError(f"every is {self.every}; give 1 (all rows and columns) to 16")
+        if self.events is None and (self.camera.event_mosaic or self.alignment != AlignmentInfo()):
+            raise ConfigError("events is null; leave out what is about them: alignment, camera.event_mosaic")
         linear = {f"camera.{name}": getattr(self.camera, name) for name in ("mosaic", "colour", "white_dn")}
         for name, value in (linear | {"dark": self.dark}).items() if self.camera.log is not None else ():
             if value is not None:

@@ -142,11 +142,13 @@ def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tupl
         notes.append(
             f"log frames made linear: {log.codes_per_efold:g} codes per e-fold, {log.white_code:g} white"
         )
+    if info.camera.tone:
+        notes.append(f"frames made linear: {info.camera.tone} undone")
     size = frames.shape[1:]
     if white is not None and frames.dtype == np.uint8:
         raise DataError(f"{folder}: camera.white_dn is {white}, and frames have 8 bits; leave it out")
     peak = float(white or np.iinfo(frames.dtype).max)
-    filters = size, info.camera.colour, info.camera.mosaic
+    filters = size, info.camera.colour, info.camera.mosaic, info.camera.tone
     dark, flat = (read_image(inside(folder, one), *filters) if one else None for one in (info.dark, info.flat))
     flat = log.levels(flat, f"{folder}: ") if log is not None and flat is not None else flat
     is_corrected = dark is not None or flat is not None

@@ -20,6 +20,7 @@ from PIL import Image, UnidentifiedImageError
 
 from evnlos.cameras.frame_camera import of_mosaic
 from evnlos.cameras.video import open_video
+from evnlos.cameras.video_files import Tone, to_light
 from evnlos.data.capture_info import CaptureInfo, inside
 from evnlos.errors import DataError
 from evnlos.events import FrameReader, FrameStack, gather_frames, iter_frames
@@ -46,7 +47,11 @@ class FrameSeries:
 
 
 def read_image(
-    path: Path, size: tuple[int, int] | None = None, colour: Colour | None = None, mosaic: Mosaic | None = None
+    path: Path,
+    size: tuple[int, int] | None = None,
+    colour: Colour | None = None,
+    mosaic: Mosaic | None = None,
+    tone: Tone | None = None,
 ) -> NDArray:
     """Read an image, or one colour of it, as uint8 or uint16 [H, W].
 
@@ -55,6 +60,7 @@ def read_image(
         size: Rows and columns that it has to have.
         colour: The colour; None is grey. A grey image has the same of each.
         mosaic: Colour filters, where the file holds raw values behind them.
+        tone: Tone curve of its numbers, which is undone, in uint16; None where they grow as the light.
 
     Raises:
         DataError: It can't be read, or has another size.
@@ -66,7 +72,12 @@ def read_image(
                 raise DataError(f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}")
             if image.mode == "F" and not np.isfinite(np.asarray(image)).all():
                 raise DataError(f"{path} holds NaN or infinity; leave it out or mend it")
-            if image.mode.startswith("I;16"):
+            if tone is not None:
+                is_grey = image.mode.startswith(("I;16", "L"))
+                codes = np.asarray(image if is_grey else image.convert("RGB"))
+                light = to_light(codes, tone, float(np.iinfo(codes.dtype).max), colour)
+                array = np.rint(light * (65_535 / 255)).astype(np.uint16)
+            elif image.mode.startswith("I;16"):
                 array = np.asarray(image)
             elif mosaic is not None or colour is None:
                 if mosaic is not None and np.ptp(np.asarray(image.convert("RGB")), axis=-1).any():
@@ -104,6 +115,10 @@ def read_frame_series(
     if path.suffix.lower() == ".csv":
         return _from_table(folder, path, info, size, most)
     if path.suffix.lower() in _RECORDINGS:
+        if info.camera.tone is not None:
+            raise DataError(
+                f"{path}: camera.tone is of images and videos; leave it out, or save the frames as such"
+            )
         if info.camera.colour is not None or info.camera.mosaic is not None:
             raise DataError(f"{path}: its frames are read as grey; save them as images to take their colours")
         read = lambda: iter_frames(path, topic=info.frames_topic)  # noqa: E731
@@ -176,7 +191,13 @@ def _video_frames(folder: Path, path: Path, info: CaptureInfo, room: int | None)
     camera = info.camera
     colour = camera.colour if camera.mosaic is None else None
     cure = "save whole numbers of 16 bits, of which 65535, or camera: {white_dn: ...} in capture.yaml, is white"
-    video = open_video(path, fps=None if timed else _rate(path, info), colour=colour, white_cure=cure)
+    video = open_video(
+        path,
+        fps=None if timed else _rate(path, info),
+        colour=colour,
+        tone=camera.tone or "as-is",
+        white_cure=cure,
+    )
     if room is not None:
         _check_size(path, (video.frames or 1) * video.width * video.height * 2, room)
     most, kind = (255, np.uint8) if camera.log and video.white <= 255 else (65_535, np.uint16)
@@ -212,7 +233,7 @@ def _from_table(
         before = named.setdefault(row["file"] or "", k)
         if before != k:
             raise DataError(f"{path}: frames {before} and {k} are both {row['file']}; name every image once")
-    filters = size, info.camera.colour, info.camera.mosaic
+    filters = size, info.camera.colour, info.camera.mosaic, info.camera.tone
     first = read_image(inside(folder, rows[0]["file"] or "", path.name), *filters)
     _check_size(path, len(rows) * first.nbytes, most)
     images = np.empty((len(rows), *first.shape), first.dtype)
