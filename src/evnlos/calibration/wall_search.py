@@ -358,9 +358,6 @@ def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
     return FACTORS[int(errors.argmin())]
 
 
-_BENT, _BENT_SHARE = 0.3, 0.05  # curvature, and share of the misfit that it explains, beyond which it is told
-
-
 def curvature(frames: NDArray, light: NDArray) -> tuple[float, float]:
     """Return how curved a camera's numbers are over light, and the share of the misfit that this explains.
 
@@ -392,7 +389,9 @@ def curve_warning(found: tuple[float, float]) -> list[str]:
     Args:
         found: What `curvature` returned.
     """
-    if abs(bent := found[0]) < _BENT or found[1] < _BENT_SHARE:
+    if (
+        abs(bent := found[0]) < 0.3 or found[1] < 0.05
+    ):  # of rooms whose frames are linear the most is 0.05, 0.01
         return []
     what = (
         f"frames: their numbers are curved over the light ({bent:+.1f}; linear is 0, sRGB -0.6, a logarithm -1)"

@@ -73,7 +73,7 @@ def read_image(
             if image.mode == "F" and not np.isfinite(np.asarray(image)).all():
                 raise DataError(f"{path} holds NaN or infinity; leave it out or mend it")
             if tone is not None:
-                is_grey = image.mode.startswith(("I;16", "L"))
+                is_grey = image.mode == "L" or image.mode.startswith("I;16")
                 codes = np.asarray(image if is_grey else image.convert("RGB"))
                 light = to_light(codes, tone, float(np.iinfo(codes.dtype).max), colour)
                 array = np.rint(light * (65_535 / 255)).astype(np.uint16)
