@@ -17,14 +17,13 @@ import yaml
 
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
-from evnlos.registry import NESTED, Kinded, migrate
+from evnlos.registry import NESTED, UNSTATED, Kinded, migrate
 from evnlos.untrusted import open_regular
 
 T = TypeVar("T")
 
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast where it was built
-_MOST_BYTES, _BYTES_A_NODE = 1 << 20, 16
-_MOST_DEPTH = 100
+_MOST_BYTES, _BYTES_A_NODE, _MOST_DEPTH = 1 << 20, 16, 100
 RANGES = {
     "_px_m": (1e-9, 1e9),
     "_m_s": (1e-9, 1e4),
@@ -75,7 +74,8 @@ def to_dict(config: Any) -> dict[str, Any]:
         >>> to_dict(Plane(64, 96, 0.0025))
         {'height': 64, 'width': 96, 'pitch_m': 0.0025, 'center_m': [0.0, 0.0]}
     """
-    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    stated = dataclasses.asdict(config, dict_factory=lambda pairs: dict(p for p in pairs if p != UNSTATED))
+    return json.loads(json.dumps(stated, default=str))
 
 
 def from_dict(

@@ -187,6 +187,9 @@ class Kinded:
         return core_schema.no_info_plain_validator_function(validated)
 
 
+UNSTATED = ("kind", "linear")
+"""What settings files and hashes leave out: frame cameras had no kinds, and those of before were linear."""
+
 try:
     __version__ = version("evnlos")
 except PackageNotFoundError:  # a source tree that was never installed
@@ -308,11 +311,6 @@ def _network(values: dict[str, Any]) -> dict[str, Any]:
     return _renamed(values, strengths="ridge_multipliers")
 
 
-def _linear_camera(values: dict[str, Any]) -> dict[str, Any]:
-    """Leave the kind of a linear frame camera out, which it does not state: its files are as of old."""
-    return {key: value for key, value in values.items() if (key, value) != ("kind", "linear")}
-
-
 def _glyphs(values: dict[str, Any]) -> dict[str, Any]:
     """Hidden characters of any kind."""
     return _renamed(values, plate="target_plane")
@@ -393,7 +391,6 @@ _STEPS: dict[str, tuple[Step, ...]] = {
     "CaptureInfo": (partial(_renamed, rig="setup"),),
     "TargetInfo": (partial(_renamed, plate_m="size_m"),),
     "PaperSetup": (_paper_setup,),
-    "FrameCamera": (_linear_camera,),
     **dict.fromkeys(_GLYPHS, (_glyphs,)),
     **dict.fromkeys(("UNetConfig", "SequenceConfig"), (_network,)),
 }

@@ -242,7 +242,6 @@ class FrameCamera(FrameCameraSettings):
         array([[[64, 64]]], dtype=uint8)
     """
 
-    kind: ClassVar[str] = "linear"
     exposure_s: float = 0.01
     """Exposure time, seconds; the light is averaged over it."""
     full_well_e: float = 15_000.0
@@ -263,6 +262,8 @@ class FrameCamera(FrameCameraSettings):
     """Seed of the fixed pattern; None = a new pattern for each capture."""
     electrons_per_s: float | None = None
     """Electrons per second at white, collected over the exposure; None = white fills the well."""
+    kind: Literal["linear"] = "linear"
+    """Kind of this frame camera: linear, or log for logarithmic pixels."""
 
     def __post_init__(self) -> None:
         for name, unit in (
@@ -461,9 +462,6 @@ class LogFrameCamera(LogResponse, FrameCameraSettings):
             light: Mean light, white levels, [...].
             frames: Frames that are averaged.
             fpn_corrected: Whether the fixed pattern was measured and taken off.
-
-        Returns:
-            Variance, white levels squared, [...].
 
         Example:
             >>> camera = LogFrameCamera(codes_per_efold=500.0, noise_codes=10.0)
