@@ -136,6 +136,7 @@ WHOLE_CHAPTERS = {
     "inverse/event_images.py",
     "inverse/event_likelihood.py",
     "lab/light_path.py",
+    "live/run.py",
     "models/posterior.py",
     "models/sequence.py",
     "optics/corner.py",

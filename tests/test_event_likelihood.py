@@ -37,7 +37,7 @@ from evnlos.inverse import (
     sequence_light,
 )
 from evnlos.live.packet import Chunk
-from evnlos.live.run import SoFar
+from evnlos.live.run import ImagesSoFar
 from evnlos.metrics import psnr
 from evnlos.models import SequenceConfig, Weights
 from evnlos.scene import HandwritingGlyphs, Scene, Target
@@ -391,16 +391,12 @@ def test_a_live_image_of_all_so_far_is_that_of_their_surface(tmp_path: Path) -> 
     at = BENCH.motion.position_m(edges[1:] * 1e-6)
     inputs = network.modality.inputs(np.zeros((1, 64, 96)), surface)
     expected = network.seeing(replace(sampling, surface="so-far")).infer(inputs, at)[0].numpy()
-    given = Weights(network), BENCH.motion, (0, 8_000_000), events.shape
-    for parts in (1, 3):
-        running = SoFar(*given)
-        running.begin()
-        running.add([Chunk(events.between(0, 1_000_000), 1_000_000, 0.0, 0.0)])  # a replay that begins again
+    running = ImagesSoFar(Weights(network), BENCH.motion, (0, 8_000_000), events.shape)
+    assert running.after([Chunk(events.between(0, 0), 0, 0.0, 0.0)]) is None
+    for parts in (1, 3):  # of a replay that begins again
         for first, stop in pairwise(np.linspace(0, 8_000_001, parts + 1).astype(int).tolist()):
-            running.add([Chunk(events.between(first, stop), stop - 1, 0.0, 0.0, restart=first == 0)])
-        running.finish()
-        assert np.square(running.newest - expected).mean() < 1e-3 * np.square(expected).mean()
-        assert 1 <= running.summary()["images"] <= parts + 1
+            found = running.after([Chunk(events.between(first, stop), stop - 1, 0.0, 0.0, restart=first == 0)])
+        assert found is not None and np.square(found - expected).mean() < 1e-3 * np.square(expected).mean()
 
 
 def test_the_surface_is_refused_without_setup_or_motion() -> None:

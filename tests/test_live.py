@@ -714,6 +714,7 @@ def test_the_image_of_all_so_far_stands_beside_a_replay(tiny_captures, tmp_path:
     for part in capture_replay(folder, speed=10, clock=Turned()).chunks(NEVER):
         beside.add([part])
     beside.finish()
+    beside.close()
     seen = network.modality.inputs(samples.frame, samples.surface)
     expected = network.infer(seen, samples.position_m, so_far=True)[-1].numpy()
     np.testing.assert_allclose(beside.newest, expected, atol=1e-5)

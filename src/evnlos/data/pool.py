@@ -14,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -205,6 +205,13 @@ def _workers(count: int) -> Iterator[tuple[ProcessPoolExecutor, int]]:
         _kept.append(pool)
     else:
         pool.executor.shutdown()
+
+
+@contextmanager
+def one_worker() -> Iterator[Executor]:
+    """Give a process beside this one that does one task after the other; left by an error it ends at once."""
+    with _workers(1) as (executor, _):
+        yield executor
 
 
 def _begin() -> None:

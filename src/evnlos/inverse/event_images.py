@@ -335,7 +335,7 @@ def _drawn(
 class RunningEventImages:
     """The target that events show while they come: `event_images` of those so far, one instant after the other.
 
-    Each search begins where the last one ended. A run in a thread beside others leaves them the interpreter.
+    Each search begins where the last one ended.
 
     Args:
         span_us: First and last instant of the sequence, microseconds on the events' clock.

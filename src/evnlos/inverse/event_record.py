@@ -234,7 +234,7 @@ def _assembled(
     return EventRecord(pixel, t_s, sign, origin)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def crossings(levels, step, on, off, fall, lift, noise, first_noise, out):
     """Fill the events of levels that are lines between instants; return their number.
 

@@ -43,7 +43,7 @@ _ACTIVE = 0.01  # weight of a silence, in that of a threshold just met, below wh
 _SAFE = 1e-3  # white levels under which no light is taken to lie
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _level(bright, scale, offset):
     """Return log light of a light in DN, and its derivative by the light, per DN."""
     bright = max(scale * bright + offset, 0.0)
@@ -52,7 +52,7 @@ def _level(bright, scale, offset):
     return bright * KNEE_SLOPE, scale * KNEE_SLOPE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _at_instants(light, pixel, at, scale, offset, speed, floor, node, before, values):
     """Fill what the light of `pixel` [N] is at instants `at` [N], in nodes.
 
@@ -78,7 +78,7 @@ def _at_instants(light, pixel, at, scale, offset, speed, floor, node, before, va
         node[n], before[n] = (k if place - k < 0.5 else k + 1), k
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _furthest(origin, sign, change, up, down):
     """Fill where the level of each gap is furthest up and down, by the instant that it begins at; -1 = none."""
     up[:] = -1
@@ -91,7 +91,7 @@ def _furthest(origin, sign, change, up, down):
             down[start] = n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _rows(seen, place, at, origin, slope, wait, rows):
     """Fill the derivatives of the changes of instants `at` by the coefficients and the leak, [n, k + 1]."""
     count = seen.shape[1]
@@ -103,7 +103,7 @@ def _rows(seen, place, at, origin, slope, wait, rows):
         rows[n, count] = wait[at[n]]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _rate_rows(moved, seen, place, slope, bend, rows):
     """Fill the derivatives of the rates by the coefficients and the leak, [n, k + 1]."""
     count = seen.shape[1]
@@ -114,7 +114,7 @@ def _rate_rows(moved, seen, place, slope, bend, rows):
         rows[n, count] = 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _sums(rows, weight, residual, group, summed, total, seen):
     """Add up w J [G, k + 1], w and w y [G] of the groups of rows; equal numbers lie side by side."""
     place = -1

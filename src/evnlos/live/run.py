@@ -1,7 +1,7 @@
 """A live run, and its statistics.
 
 - What a live run did: images, latencies, drops, rates; as numbers and as a table.
-- The image of all that was seen so far, made beside a run in a thread of its own, as often as it is worth it.
+- The image of all that was seen so far, made beside a run in a process of its own, as often as it is worth it.
 - A live run: the source fills a queue in its own thread, the network empties it, sinks get the images.
 """
 
@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -22,6 +23,8 @@ from evnlos.live.packet import Chunk, ChunkQueue, Clock, EventSource, SystemCloc
 from evnlos.types import Events
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from evnlos.live.engine import Engine, Picture
     from evnlos.models import Weights
     from evnlos.scene import Motion
@@ -157,24 +160,17 @@ class RateOptions:
             raise ConfigError(f"seconds is {self.seconds}; give a positive number")
 
 
-_WORTH, _FEWEST_EVENTS = 1.1, 500  # times as many events as the image before knew; for the first
+class ImagesSoFar:
+    """Images of all that was seen so far, by a network of whole sequences, one after the other.
 
-
-class SoFar:
-    """The image of all that was seen so far, made beside a run in a thread of its own.
-
-    A network of whole sequences sees the target that the events so far make most likely, and all frames so far
-    but the first: images of `evnlos reconstruct --so-far`, but for where each search begins.
+    It sees the target that the events so far make most likely, and all frames so far but the first: images of
+    `evnlos reconstruct --so-far`, but for where each search begins.
 
     Args:
         weights: Such a network; its samples name the setup whose light path is undone.
         motion: Of the target, on the clock of the source.
         span_us: First and last instant of the sequence, microseconds.
         shape: Rows and columns of the event camera.
-
-    Attributes:
-        newest: The newest image, float32 [H, W], 0..1; black before the first.
-        seconds: How long each image took.
 
     Raises:
         ConfigError: The setup is unknown.
@@ -186,46 +182,148 @@ class SoFar:
     ) -> None:
         from evnlos.inverse import RunningEventImages
 
-        network, sampling = weights.network, weights.sampling
-        if not network.sees_sequence or (weights.modality.needs_events and not sampling.is_solved):
-            raise DataError(
-                "these weights do not see what all events and frames so far say of the target; give weights of "
-                "whole sequences and the surface 'likelihood', such as near-event-sequence"
-            )
-        self._network = network.seeing(replace(sampling, surface="so-far")).eval()
+        _check_sequence(weights)
+        sampling = weights.sampling
+        self._network = weights.network.seeing(replace(sampling, surface="so-far")).eval()
         self._modality, self._motion, self._canvas = weights.modality, motion, sampling.canvas
         known = span_us, motion, sampling.setup, sampling.canvas, shape
         self._events = RunningEventImages(*known) if self._modality.needs_events else None
-        self.seconds = list[float]()
-        self._fault: DataError | None = None
-        self._news, self._ended = threading.Condition(), False
-        self._thread = threading.Thread(target=self._work, name="so far", daemon=True)
         self._forget()
 
     def _forget(self) -> None:
-        self._parts, self._count = list[Events](), 0
+        self._parts, self._until_us = list[Events](), 0
         self._frames, self._times_us = list[NDArray[np.float32]](), list[int]()
-        self._until_us, self._known, self._frames_known = 0, 0, 0
-        self._is_new = True
-        self.newest = np.zeros(self._canvas.shape, np.float32)
+        if self._events is not None:
+            self._events.begin()
+
+    def after(self, chunks: Sequence[Chunk]) -> NDArray[np.float32] | None:
+        """Take what came and return the image, float32 [H, W], 0..1; None where there is none to be made.
+
+        Raises:
+            DataError: The target is off the canvas.
+        """
+        import torch
+
+        from evnlos.data.sampling import reduce_by_area
+
+        for chunk in chunks:
+            if chunk.restart:
+                self._forget()
+            self._parts += [chunk.events] if len(chunk.events) else []
+            self._until_us = chunk.until_us
+            if chunk.frame is not None:
+                self._frames.append(reduce_by_area(np.asarray(chunk.frame), self._canvas.shape))
+                self._times_us.append(chunk.until_us if chunk.frame_us is None else chunk.frame_us)
+        frames, times_us = self._frames[1:], self._times_us[1:]
+        if not self._modality.needs_frames:
+            frames, times_us = [np.zeros(self._canvas.shape, np.float32)], [self._until_us]
+        if not frames or (self._events is not None and not self._parts):
+            return None
+        at = self._motion.position_m(np.asarray(times_us, np.float64) * 1e-6)
+        surface = np.zeros((len(frames), 2, *self._canvas.shape), np.float32)
+        if self._events is not None:
+            self._parts = [Events.concatenate(self._parts)]
+            surface[-1] = self._events.at(self._parts[0], times_us[-1], at[-1])
+        with torch.inference_mode():
+            place = torch.from_numpy(at.astype(np.float32))
+            seen = self._modality.inputs(np.stack(frames), surface)
+            return self._network.draw(seen, place, place[-1:])[0].numpy()
+
+
+def _check_sequence(weights: Weights) -> None:
+    if not weights.network.sees_sequence or (weights.modality.needs_events and not weights.sampling.is_solved):
+        raise DataError(
+            "these weights do not see what all events and frames so far say of the target; give weights of "
+            "whole sequences and the surface 'likelihood', such as near-event-sequence"
+        )
+
+
+_held: ImagesSoFar | None = None  # of a process beside a run
+
+
+def _hold(*about: Any) -> None:
+    global _held
+    _held = ImagesSoFar(*about)
+
+
+def _timed(chunks: Sequence[Chunk]) -> tuple[NDArray[np.float32] | None, float]:
+    assert _held is not None
+    began_s = time.perf_counter()
+    return _held.after(chunks), time.perf_counter() - began_s
+
+
+_WORTH, _FEWEST_EVENTS = 1.1, 500  # times as many events as the image before knew; for the first
+
+
+class SoFar:
+    """`ImagesSoFar` beside a run, in a process of their own: the run's images wait for none of them.
+
+    Args:
+        weights: As for `ImagesSoFar`.
+        about: Its other arguments.
+
+    Attributes:
+        seconds: How long each image took.
+
+    Raises:
+        DataError: The weights do not fit.
+    """
+
+    def __init__(self, weights: Weights, *about: Any) -> None:
+        _check_sequence(weights)
+        self._about, self._ending = (weights, *about), ExitStack()
+        self._sees_events = weights.modality.needs_events
+        self.seconds = list[float]()
+        self._fault: DataError | None = None
+        self._waiting, self._count, self._known = list[Chunk](), 0, 0
+        self._at_work: Future[tuple[NDArray[np.float32] | None, float]] | None = None
+        self._image = np.zeros(weights.sampling.canvas.shape, np.float32)
 
     def begin(self) -> None:
-        """Start the thread."""
-        self._thread.start()
+        """Start the process and wait until it is ready; errors are those of `ImagesSoFar`."""
+        from evnlos.data.pool import one_worker
+
+        self._worker = self._ending.enter_context(one_worker())
+        self._worker.submit(_hold, *self._about).result()
 
     def add(self, chunks: Sequence[Chunk]) -> None:
-        """Take what came, without waiting for an image."""
-        with self._news:
-            for chunk in chunks:
-                if chunk.restart:
-                    self._forget()
-                self._parts += [chunk.events] if len(chunk.events) else []
-                self._count += len(chunk.events)
-                self._until_us = chunk.until_us
-                if chunk.frame is not None:
-                    self._frames.append(np.ascontiguousarray(chunk.frame, np.float32))
-                    self._times_us.append(chunk.until_us if chunk.frame_us is None else chunk.frame_us)
-            self._news.notify()
+        """Take what came, and begin an image where that is worth it and none is at work; wait for nothing."""
+        for chunk in chunks:
+            if chunk.restart:
+                self._count = self._known = 0
+                self._image = np.zeros_like(self._image)
+            self._waiting.append(chunk)
+            self._count += len(chunk.events) if self._sees_events else chunk.frame is not None
+        self._take_if_done()
+        least = max(_FEWEST_EVENTS, _WORTH * self._known) if self._sees_events else self._known + 1
+        if self._at_work is None and self._count >= least:
+            self._begin_image()
+
+    def _begin_image(self) -> None:
+        self._at_work, self._known = self._worker.submit(_timed, self._waiting), self._count
+        self._waiting = []
+
+    @property
+    def newest(self) -> NDArray[np.float32]:
+        """The newest image, float32 [H, W], 0..1; black before the first."""
+        self._take_if_done()
+        return self._image
+
+    def _take_if_done(self) -> None:
+        if self._at_work is not None and self._at_work.done():
+            self._take()
+
+    def _take(self) -> None:
+        assert self._at_work is not None
+        done, self._at_work = self._at_work, None
+        try:
+            image, seconds = done.result()
+        except DataError as error:  # the target is off the canvas yet
+            self._fault = error
+            return
+        if image is not None and self._known:  # else the replay began anew meanwhile
+            self._image = image
+            self.seconds.append(seconds)
 
     def finish(self) -> None:
         """Wait for the image of everything.
@@ -233,67 +331,21 @@ class SoFar:
         Raises:
             DataError: There was never an image, and why.
         """
-        with self._news:
-            self._ended = True
-            self._news.notify()
-        self._thread.join()
+        if self._at_work is not None:
+            self._take()
+        if self._waiting and self._count > self._known:
+            self._begin_image()
+            self._take()
         if self._fault is not None and not self.seconds:
             raise self._fault
+
+    def close(self) -> None:
+        """End the process, once it is done with an image that it is at."""
+        self._ending.close()
 
     def summary(self) -> dict[str, Any]:
         """Return how many images there were, and the median of their times, seconds."""
         return {"images": len(self.seconds), "seconds": round(float(np.median(self.seconds or [0.0])), 3)}
-
-    def _is_worth(self) -> bool:
-        """Return whether enough came since the image before; at the end anything is."""
-        if self._modality.needs_frames and len(self._frames) < 2:
-            return False
-        if self._events is None:
-            return len(self._frames) > self._frames_known
-        least = self._known + 1 if self._ended else max(_FEWEST_EVENTS, _WORTH * self._known)
-        return self._count >= least
-
-    def _work(self) -> None:
-        while True:
-            with self._news:
-                self._news.wait_for(lambda: self._ended or self._is_worth())
-                if not self._is_worth():
-                    return
-                seen = Events.concatenate(self._parts) if self._parts else None
-                self._parts = [] if seen is None else [seen]
-                self._known, self._frames_known = self._count, len(self._frames)
-                frames, times_us, until_us = self._frames[1:], self._times_us[1:], self._until_us
-                if self._is_new and self._events is not None:
-                    self._events.begin()
-                self._is_new = False
-            began_s = time.perf_counter()
-            try:
-                image = self._image(seen, frames, times_us, until_us)
-            except DataError as error:  # the target is off the canvas yet
-                self._fault = error
-                continue
-            with self._news:
-                if not self._is_new:  # else it began anew meanwhile
-                    self.newest = image
-                    self.seconds.append(time.perf_counter() - began_s)
-
-    def _image(
-        self, events: Events | None, frames: list[NDArray], times_us: list[int], until_us: int
-    ) -> NDArray[np.float32]:
-        import torch
-
-        from evnlos.data.sampling import reduce_by_area
-
-        if not self._modality.needs_frames:
-            frames, times_us = [np.zeros(self._canvas.shape, np.float32)], [until_us]
-        at = self._motion.position_m(np.asarray(times_us, np.float64) * 1e-6)
-        surface = np.zeros((len(frames), 2, *self._canvas.shape), np.float32)
-        if self._events is not None and events is not None:
-            surface[-1] = self._events.at(events, times_us[-1], at[-1])
-        seen = self._modality.inputs(reduce_by_area(np.stack(frames), self._canvas.shape), surface)
-        with torch.inference_mode():
-            place = torch.from_numpy(at.astype(np.float32))
-            return self._network.draw(seen, place, place[-1:])[0].numpy()
 
 
 class Sink(Protocol):
@@ -388,6 +440,8 @@ class Run:
         finally:
             self._stop.set()
             pump.join(timeout=2)
+            if so_far is not None:
+                so_far.close()
         return self.statistics
 
     def _pump(self) -> None:
