@@ -123,11 +123,15 @@ def test_invert_and_track_take_the_pattern_of_the_calibrated_folder(tmp_path, ca
     save_pattern(FixedPattern(np.ones((24, 36), np.float32), offset), folder / "pattern.safetensors")
 
     def figure(*words: str | Path) -> object:
-        options = ("--cells", 8, "--solver", "tikhonov", "--json", "--force")
+        options = () if "--from" in words else ("--cells", 8, "--solver", "tikhonov")
+        options += ("--json", "--force")
         main([str(word) for word in ("invert", capture, *options, *words)])
         return json.loads(capsys.readouterr().out)["rows"][0]["psnr_db"]
 
     out = ("--out", tmp_path / "i.png")
+    stated = figure("--setup", bare, "--pattern", folder, *out)
+    assert figure("--setup", folder, *out) == stated != figure("--setup", bare, *out)
+    out += ("--from", "frames")
     stated = figure("--setup", bare, "--pattern", folder, *out)
     assert figure("--setup", folder, *out) == stated != figure("--setup", bare, *out)
 

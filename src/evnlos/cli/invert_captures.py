@@ -22,7 +22,7 @@ from evnlos.analysis import scored_sampling, target_psnr
 from evnlos.analysis.bounds import canvas_decibel
 from evnlos.calibration.scan.importer import stills_as_scanned
 from evnlos.cli.parsing import say
-from evnlos.data import Capture, load_pattern, pattern_of, read_capture
+from evnlos.data import Capture, pattern_of, read_capture
 from evnlos.data.fixed_pattern import object_light
 from evnlos.data.sampling import read_target
 from evnlos.errors import ConfigError
@@ -276,7 +276,8 @@ def estimate_captures(
         folders: Capture folders of one setup, whose motion is stated.
         word: Their setup.
         evidence: What the likelihood is made of.
-        pattern: Fixed pattern of the frame camera; without it an offset of each pixel is integrated out.
+        pattern: Fixed pattern of the frame camera, by default the one in the setup's folder; without any an
+            offset of each pixel is integrated out.
         samples: Samples under the learned prior; 0: the Gaussian prior, without any.
         progress: Called as each capture is done.
         colours: Whether the target is solved in red, green and blue: [3, cells, cells].
@@ -285,7 +286,8 @@ def estimate_captures(
         ConfigError: The setup is not linear or has no law of events, a motion is unknown, or colours are grey.
     """
     setup, prior = linear_setup(word), load_prior() if samples else None
-    how = evidence, pattern and load_pattern(pattern), prior, samples, SequenceLights()
+    removed = None if colours or evidence == "events" else pattern_of(word, pattern)
+    how = evidence, removed, prior, samples, SequenceLights()
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
         seen = _read_colours(folder, evidence) if colours else {None: capture_of(folder, evidence)}
