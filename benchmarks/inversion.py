@@ -1,6 +1,8 @@
 """Which channel inverts better without learning, two frames or the events between them, and in which light?
+And what does the likelihood of a whole sequence cost?
 
     python benchmarks/inversion.py
+    python benchmarks/inversion.py --likelihood --write benchmarks/results/likelihood.md
 
 A character on the setup "main" (rough aluminium of roughness 0.05, 0.3 m), 30 x 48 pixels in both cameras. The
 unknown is the scene's change between two instants 0.8 s apart, 16 mm of travel (paper Eq. event_fm1 and
@@ -9,19 +11,42 @@ the threshold, linearised at the mean of the two frames. "exact" is the true cha
 what the linearisation alone costs. All by Tikhonov with the gradient towards a dark border, regularization by
 leaving out blocks of the wall; r is Pearson's correlation of the found change with the true one, mean of R, K
 and G.
+
+`--likelihood` solves simulated sequences of 160 x 100 pixels behind the published setup of `near` (8 s, 40
+frames, a letter of an unseen hand) as `evnlos invert --from events` and `--from both` do, with thresholds that
+make once, twice and four times as many events. Processor time of one thread, the light path aside, and the
+memory that the process held at most while it solved, over what it held before; each in a process of its own.
 """
+
+import argparse
+import re
+import sys
+import time
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 
-from evnlos.cameras import EventCamera, EventPixel, FrameCamera
-from evnlos.inverse import Gradient, LogChange, log_change, tikhonov
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera, simulate_events
+from evnlos.config import from_dict
+from evnlos.data import Capture, CaptureInfo
+from evnlos.inverse import Gradient, LogChange, SequenceLights, log_change, tikhonov
+from evnlos.inverse.event_images import event_prior
+from evnlos.machine import one_thread
+from evnlos.models import estimate_target
 from evnlos.optics import MatrixTransport
 from evnlos.scene import HandwritingGlyphs, Scene
-from evnlos.setups import RadiometricSetup
+from evnlos.setups import RadiometricSetup, Setup, load_setup
+from machine import machine
 
 SHAPE = (30, 48)
 TIMES_S = (3.6, 4.4)
+NEAR = Path(__file__).parents[1] / "packages/evnlos-weights/src/evnlos_weights/near.yaml"
+SENSOR, SECONDS, FRAMES, THRESHOLD = (100, 160), 8.0, 40, 0.2
+Evidence = Literal["events", "both"]
 
 
 def correlation(image: torch.Tensor, truth: torch.Tensor) -> float:
@@ -55,7 +80,78 @@ def compare(gain: float, ambient: float, character: str, seed: int = 0) -> dict[
     return row | {"events per pixel": len(events) / (SHAPE[0] * SHAPE[1])}
 
 
-if __name__ == "__main__":
+def sequence(threshold: float, lights: SequenceLights) -> Capture:
+    """Return a capture of a letter whose pixels have such thresholds, log units."""
+    info = from_dict(
+        CaptureInfo,
+        {
+            "camera": {"height": SENSOR[0], "width": SENSOR[1]},
+            "motion": {"start_m": -0.08, "speed_m_s": 0.02},
+        },
+        source="a benchmark",
+    )
+    times_us = np.arange(FRAMES + 1) * int(1e6 * SECONDS / FRAMES)
+    blank = np.zeros((len(times_us), *SENSOR), np.uint8)
+    empty = Capture("letter", info, simulate_events(blank[:2], [0.0, SECONDS]), blank, times_us, None)
+    setup = pixels(threshold)
+    basis, motion = event_prior(setup, info.target_size_m, 120), empty.motion
+    assert motion is not None
+    light = lights.of(setup.seen_by(SENSOR), basis, motion.in_its_plane(), (0.0, SECONDS), SENSOR)
+    letter = HandwritingGlyphs().target("writer03_R").rasterise(basis.target_plane)
+    seen = np.maximum(light(basis.coefficients(letter.astype(np.float64))), 1e-3)
+    video = np.ascontiguousarray(255 * seen.T.reshape(-1, *SENSOR), np.float32)
+    events = simulate_events(video, light.times_s, setup.pixel, seed=1)
+    everywhere = np.arange(len(seen))
+    at = [light.at(seen, everywhere, np.full(len(seen), 1e-6 * t)).reshape(SENSOR) for t in times_us]
+    return replace(empty, events=events, frames=setup.frame_camera.expose(np.array(at), 1))
+
+
+def pixels(threshold: float) -> Setup:
+    """Return the setup of `near` with such thresholds, log units, and few noise events."""
+    setup = load_setup(NEAR)
+    changes = {"threshold_on": threshold, "threshold_off": threshold, "shot_noise_rate_hz": 0.02}
+    return replace(setup, pixel=replace(setup.pixel, **changes, threshold_sigma=0.2 * threshold))
+
+
+def held_mib(key: str) -> float:
+    """Return what this process holds, MiB: now (`VmRSS`) or at most (`VmHWM`)."""
+    found = re.search(rf"{key}:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return int(found[1]) / 1024 if found else float("nan")
+
+
+def cost(evidence: Evidence, threshold: float) -> tuple[int, float, float, float]:
+    """Return events, seconds, MiB beside what was held before, and PSNR over the target plane, dB."""
+    one_thread()
+    lights = SequenceLights()
+    capture, setup = sequence(threshold, lights), pixels(threshold)
+    before = held_mib("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the most that was held counts from now
+    begun = time.process_time()
+    found = estimate_target(capture, setup, evidence, lights=lights)
+    seconds = time.process_time() - begun
+    truth = HandwritingGlyphs().target("writer03_R").rasterise(found.plane)
+    psnr = -10 * float(np.log10(np.square(found.image - truth).mean()))
+    return len(capture.events), seconds, held_mib("VmHWM") - before, psnr
+
+
+def costs() -> str:
+    """Return the table of what the likelihood costs, as Markdown."""
+    lines = ["# What the likelihood of a sequence costs", "", f"`python {' '.join(sys.argv)}`", ""]
+    lines += [f"{machine()}; one thread, other work beside it", ""]
+    lines += ["| from | events | seconds of one core | us per event | MiB | PSNR over the target, dB |"]
+    lines += ["|---" * 6 + "|"]
+    for evidence in ("events", "both"):
+        for times in (1, 2, 4):
+            with get_context("spawn").Pool(1) as pool:
+                count, seconds, mib, psnr = pool.apply(cost, (evidence, THRESHOLD / times))
+            each = f"{1e6 * seconds / count:.0f} | {mib:.0f} | {psnr:.2f}"
+            lines.append(f"| {evidence} | {count:,} | {seconds:.1f} | {each} |")
+            print(lines[-1], flush=True)
+    return "\n".join(lines) + "\n"
+
+
+def channels() -> None:
+    """Print the table of frames beside events."""
     names = None
     for gain, ambient in ((0.8, 0.02), (0.8, 0.2), (0.2, 0.02), (0.2, 0.2), (0.2, 0.7), (0.05, 0.02)):
         rows = [compare(gain, ambient, character) for character in "RKG"]
@@ -64,3 +160,16 @@ if __name__ == "__main__":
             print("| gain | ambient | " + " | ".join(names) + " |\n|" + "---|" * (2 + len(names)))
         cells = " | ".join(f"{np.mean([row[name] for row in rows]):.2f}" for name in names)
         print(f"| {gain} | {ambient} | {cells} |", flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--likelihood", action="store_true", help="what the likelihood of a sequence costs")
+    parser.add_argument("--write", type=Path, help="file for that table")
+    asked = parser.parse_args()
+    if asked.likelihood:
+        page = costs()
+        if asked.write:
+            asked.write.write_text(page)
+    else:
+        channels()

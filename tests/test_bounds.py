@@ -2,15 +2,18 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from evnlos.analysis import (
+    AnalysisSettings,
     SequenceAnalysisSettings,
     event_information,
     frame_information,
+    identify,
     row_information,
     sequence_bounds,
 )
@@ -28,6 +31,7 @@ from evnlos.inverse import (
     record_of,
     sequence_light,
 )
+from evnlos.plot.setup import draw_identification
 from evnlos.scene import LineMotion, Target
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.types import Events, Plane
@@ -237,7 +241,11 @@ def test_more_noise_or_mismatch_never_helps(light: SequenceLight) -> None:
 def test_an_unknown_pattern_costs_and_fades_with_its_size(light: SequenceLight) -> None:
     def information(known: bool, dsnu_e: float) -> np.ndarray:
         setup = replace(SETUP, frame_camera=FrameCamera(prnu=0.0, dsnu_e=dsnu_e))
-        return frame_information(light, np.zeros(6), setup, replace(SETTINGS, fpn_corrected=known))
+        asked = replace(SETTINGS, fpn_corrected=known)
+        two = frame_information(light, np.stack([np.zeros(6), np.ones(6)]), setup, asked)
+        alone = [frame_information(light, z, setup, asked) for z in (np.zeros(6), np.ones(6))]
+        np.testing.assert_array_equal(two, alone)  # at several targets, as at each
+        return two[0]
 
     known = information(True, 100.0)
     for one, other in zip(known, information(False, 100.0), strict=True):
@@ -264,6 +272,20 @@ def test_bounds_of_a_setup() -> None:
     assert "|" not in shown and len(ends) == 1 and len(rows) == 2 + 2 * 4  # columns, for a terminal
     for cell in re.findall(r"[\d.]+(?= \|)", table):
         assert cell in shown
+
+
+def test_the_figure_of_a_setup_draws_them_over_the_number_of_positions(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    found = identify(SETUP, AnalysisSettings(cells=8, height=8, width=12, writers=1), "small")
+    limits = sequence_bounds(SETUP, replace(SETTINGS, other_noises=(0.06,)), "small")
+    for k, given in enumerate((limits, None)):
+        words = re.findall(
+            "<!-- (.*?) -->", draw_identification(found, tmp_path / f"{k}.svg", given).read_text()
+        )
+        drawn = {"positions", "frames", "both, continuous, 3.0 %", "events, continuous, 3.0 %", "6 %"}
+        drawn |= {"events, v2e, brownian, circuit", "prior alone"}
+        assert drawn <= set(words) if given else not drawn & set(words)
+        assert {"mode", "noise", "truth"} <= set(words)
 
 
 def test_a_record_knows_where_each_event_is_measured_from() -> None:

@@ -201,15 +201,14 @@ def sequence_bounds(
     target_plane = Plane(settings.cells, settings.cells, settings.target_size_m / settings.cells)
     prior = handwritten_prior(target_plane, min(settings.coefficients, settings.cells**2), settings.writers)
     grid = (min(setup.shape[0], _GRID[0]), min(setup.shape[1], _GRID[1]))
-    span = (0.0, settings.duration_s)
-    light = sequence_light(setup, prior, settings.motion.position_m, span, grid)
+    light = sequence_light(setup, prior, settings.motion.position_m, (0.0, settings.duration_s), grid)
     # neighbours see the same: each pixel of the grid stands for several of the sensor
     pixels = setup.shape[0] * setup.shape[1] / (grid[0] * grid[1])
     targets = handwritten_targets(target_plane, settings.writers)
     chosen = [next(k for k, at in enumerate(targets.names) if at.endswith(f"_{c}")) for c in _REFERENCES]
     note("frames of the sequence")
     references = [prior.coefficients(targets.test[k].numpy()) for k in chosen]
-    frames = [pixels * frame_information(light, z, setup, settings) for z in references]
+    frames = list(pixels * frame_information(light, np.array(references), setup, settings))
     found = []
     typical = float(light(references[0]).mean()) * WHITE_DN
     for kind, pixel in _models(setup.pixel, others=settings.other_models).items():
@@ -231,38 +230,38 @@ def sequence_bounds(
 def frame_information(
     light: SequenceLight, z: np.ndarray, setup: Setup, settings: SequenceAnalysisSettings
 ) -> np.ndarray:
-    """Return the information of frames at each of the settings' numbers of positions, [counts, k, k].
+    """Return the information of frames at each of the settings' numbers of positions, [..., counts, k, k].
 
     Args:
         light: The light, linear in the coefficients.
-        z: Coefficients at whose light the camera's noise is taken, [k].
+        z: Coefficients at whose light the camera's noise is taken, [..., k].
         setup: Its frame camera.
         settings: Positions, and whether the fixed pattern is known.
     """
-    instants = np.arange(1, settings.positions + 1) * settings.duration_s / settings.positions
     chosen = [set(position_subsets(settings.positions, count, 1)[0].tolist()) for count in settings.counts]
-    everywhere, camera, size = np.arange(len(light.left)), setup.frame_camera, (len(light.left), len(z))
-    seen = light(z)
-    totals = [NormalEquations.empty(len(z)) for _ in chosen]
-    summed, weights = np.zeros((len(chosen), *size)), np.zeros((len(chosen), len(everywhere)))
+    everywhere, camera, unknowns = np.arange(len(light.left)), setup.frame_camera, z.shape[-1]
+    every_seen = [light(one) for one in z.reshape(-1, unknowns)]
+    found = np.zeros((len(every_seen), len(chosen), unknowns, unknowns))
+    size = (*found.shape[:2], len(everywhere))
+    summed, weights = np.zeros((*size, 0 if settings.fpn_corrected else unknowns)), np.zeros(size)
     for k in sorted(set().union(*chosen)):
-        now = np.full(len(everywhere), instants[k])
-        rows = light.rows(everywhere, now)
-        there = torch.from_numpy(light.at(seen, everywhere, now))
-        weight = (camera.shows(there) / camera.noise_variance(there)).numpy()  # clipped ones tell nothing
-        one = NormalEquations.empty(len(z))
-        one.add(rows, weight, np.zeros(len(rows)), everywhere, 0.0)
-        for n, mine in enumerate(chosen):
-            if k in mine:
-                totals[n].information += one.information
+        now = np.full(len(everywhere), (k + 1) * settings.duration_s / settings.positions)
+        rows = light.rows(everywhere, now)  # the same whatever is seen
+        for each, seen in enumerate(every_seen):
+            there = torch.from_numpy(light.at(seen, everywhere, now))
+            weight = (camera.shows(there) / camera.noise_variance(there)).numpy()  # clipped ones tell nothing
+            one = NormalEquations.empty(unknowns)
+            one.add(rows, weight, np.zeros(len(rows)), everywhere, 0.0)
+            for n in (n for n, mine in enumerate(chosen) if k in mine):
+                found[each, n] += one.information
                 if not settings.fpn_corrected:
-                    summed[n] += rows * weight[:, None]
-                    weights[n] += weight
-    if not settings.fpn_corrected:
+                    summed[each, n] += rows * weight[:, None]
+                    weights[each, n] += weight
+    for each, seen in enumerate(every_seen if not settings.fpn_corrected else ()):
         spread = camera.pattern_variance(torch.from_numpy(seen.mean(axis=1))).sqrt().numpy()
-        for total, parts, weight in zip(totals, summed, weights, strict=True):
-            total.subtract_offsets(parts, weight, spread)
-    return np.stack([total.information for total in totals])
+        for total, part, weight in zip(found[each], summed[each], weights[each], strict=True):
+            NormalEquations(total, np.zeros(unknowns)).subtract_offsets(part, weight, spread)
+    return found.reshape(*z.shape[:-1], *found.shape[1:])
 
 
 def event_information(

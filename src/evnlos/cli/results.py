@@ -294,7 +294,7 @@ class IdentifyCommand:
     settings: Flat[AnalysisSettings] = field(default_factory=AnalysisSettings)
     bounds: bool = False
     """Also print the expected PSNR of the best linear estimate of a moving target, from frames, from events and
-    from both, over the number of positions and for each event model; half a minute for each setup."""
+    from both, over the number of positions and for each event model; some ten seconds more for each setup."""
     sequence: SequenceAnalysisSettings = field(default_factory=SequenceAnalysisSettings)
 
     def check_names(self) -> None:
@@ -335,7 +335,7 @@ class IdentifyCommand:
         if self.out is not None:
             for one in found:
                 path = self.out / f"identify_{one.name}.png"
-                written.append(drawn(path, partial(draw_identification, one, path)))
+                written.append(drawn(path, partial(draw_identification, one, path, limits.get(one.name))))
             if len(found) > 1:
                 path = self.out / "identify_setups.png"
                 written.append(drawn(path, partial(draw_setups, found, path)))
@@ -350,7 +350,7 @@ class IdentifyCommand:
             print(f"{one.name}: {one.verdict}")
             for warning in one.warnings:
                 say(f"warning: {one.name}: {warning}")
-        whole = "what a whole sequence of frames, of events, of both shows: --bounds (half a minute per setup)"
+        whole = "what a whole sequence of frames, of events, of both shows: --bounds (ten seconds per setup)"
         print("\n".join(f"\n{limit.table(in_columns=True)}" for limit in limits.values()) or whole)
         if self.out is not None:
             print(f"{self.out}: identify.json", *(Path(one).name for one in written if one), sep=", ")

@@ -21,6 +21,7 @@ from evnlos.plot.figures import new_figure, save_figure, signed_map
 from evnlos.setups import Setup
 
 if TYPE_CHECKING:
+    from evnlos.analysis.bounds import Bounds
     from evnlos.analysis.identify import Identification
     from evnlos.inverse import CornerImage, FloorSector
     from evnlos.tracking import BearingTracks
@@ -277,12 +278,13 @@ def draw_corner(
     return save_figure(figure, path, dpi=100)
 
 
-def draw_identification(found: Identification, path: str | Path) -> Path:
+def draw_identification(found: Identification, path: str | Path, limits: Bounds | None = None) -> Path:
     """Draw singular values, the Picard plot of a typical target, the first modes, truth and linear image.
 
     Args:
         found: What `identify` returned.
         path: The image, PNG or SVG.
+        limits: What `sequence_bounds` returned: a panel more, expected PSNR over the number of positions.
 
     Returns:
         The path.
@@ -290,11 +292,14 @@ def draw_identification(found: Identification, path: str | Path) -> Path:
     Raises:
         MissingDependencyError: Matplotlib is not installed.
     """
-    figure = new_figure((10.5, 6.2))
+    figure = new_figure((10.5, 6.2) if limits is None else (12.8, 6.6))
     grid = figure.add_gridspec(2, 1, height_ratios=(1.5, 1))
-    curves, pictures = grid[0].subgridspec(1, 2), grid[1].subgridspec(2, 6)
+    curves = grid[0].subgridspec(1, 2 if limits is None else 3)
+    pictures = grid[1].subgridspec(2, 6)
     _singular_values(figure.add_subplot(curves[0]), [found])
     _picard(figure.add_subplot(curves[1]), found)
+    if limits is not None:
+        _over_positions(figure.add_subplot(curves[2]), limits)
     at = found.at_camera
     for row, (image, title) in enumerate(((found.truth, "truth"), (at.picture, "best linear"))):
         _image_of(figure.add_subplot(pictures[row, 0]), image, title)
@@ -352,6 +357,34 @@ def _picard(axes: Any, found: Identification) -> None:
     axes.axhline(1.0, color="k", lw=0.7, ls=":", label="noise")
     axes.set(xlabel="mode", xscale="log", ylim=(1e-3, None))
     axes.legend(frameon=False, fontsize=8)
+
+
+def _over_positions(axes: Any, limits: Bounds) -> None:
+    """Draw expected PSNR over the number of positions; of other errors and models only what events tell."""
+    counts, own = np.array(limits.settings.counts), limits.events[0] if limits.events else None
+    axes.plot(counts, limits.frames_db, "o-", color="C0", lw=1.6, ms=4, label="frames")
+    if own is not None:
+        what = f"{own.kind}, {100 * own.noise:.1f} %"
+        axes.plot(counts, own.both_db, "x--", color="k", lw=1.2, ms=5, label=f"both, {what}")
+        axes.plot(counts, own.events_db, "s-", color="C1", lw=1.6, ms=4, label=f"events, {what}")
+        others = [one for one in limits.events[1:] if one.kind != own.kind]
+        errors = [one for one in limits.events[1:] if one.kind == own.kind]
+        for k, one in enumerate(errors):
+            label = None if k else "events, other errors of a crossing"
+            axes.plot(counts, one.events_db, ":", color="C1", lw=1.2, label=label)
+            place = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "fontsize": 7}
+            axes.annotate(f"{100 * one.noise:.0f} %", (counts[-1], one.events_db[-1]), **place)
+        for k, one in enumerate(others):
+            label = None if k else f"events, {', '.join(other.kind for other in others)}"
+            axes.plot(counts, one.events_db, "-.", color="0.5", lw=0.9, label=label)
+    axes.axhline(limits.prior_db, color="k", lw=0.7, ls=":", label="prior alone")
+    axes.set(xlabel="positions", ylabel="expected PSNR, dB", xscale="log")
+    axes.set_xticks(counts, [str(count) for count in counts])
+    axes.minorticks_off()
+    axes.set_xlim(0.85 * counts.min(), 1.35 * counts.max())  # what stands beside the last points is inside
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.5 * (high - low))  # the legend's own room
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
 
 
 def _above(values: Any, floor: float) -> Any:
