@@ -130,6 +130,7 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/readout.py",
     "events/batch.py",
     "events/files/aedat.py",
+    "experiment/conditions.py",
     "inverse/corner.py",
     "inverse/event_likelihood.py",
     "lab/light_path.py",
