@@ -132,6 +132,7 @@ WHOLE_CHAPTERS = {
     "data/frames.py",
     "events/batch.py",
     "events/files/aedat.py",
+    "experiment/conditions.py",
     "inverse/corner.py",
     "inverse/event_images.py",
     "inverse/event_likelihood.py",

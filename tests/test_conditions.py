@@ -9,9 +9,12 @@ import torch
 
 from evnlos.cameras import FlickeringWall, FrameCamera
 from evnlos.experiment import Condition, conditions, conditions_table, regimes, sweep_parameters
-from evnlos.inverse import SequenceLight
+from evnlos.inverse import SequenceLight, handwritten_prior, sequence_light
+from evnlos.inverse.prior import TRAIN_CHARACTERS
 from evnlos.plot.figures import draw_regimes
+from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import SensorSize
+from evnlos.types import Plane
 
 module = importlib.import_module("evnlos.experiment.conditions")
 
@@ -35,6 +38,72 @@ def test_conditions_have_names_of_their_own_and_clip_nothing() -> None:
     assert (found[0].shading() == 1).all()
 
 
+def test_noise_in_the_dark_is_not_clipped_and_rounding_hides_little_of_it() -> None:
+    """At the largest gain zero electrons less four deviations are still above 0; rounding is a hundredth."""
+    for bit_depth in (8, 12):
+        camera = replace(Condition("dark", bit_depth=bit_depth).setup.frame_camera, gain=32.0)
+        deviation = np.hypot(camera.read_noise_e, camera.dsnu_e) * camera.dn_per_electron
+        assert camera.black_level > 4 * deviation
+        assert 0.01 * (camera.read_noise_e * camera.dn_per_electron) ** 2 > 1 / 12
+
+
+def test_light_and_speed_of_a_condition_scale_the_light_of_one_way() -> None:
+    prior = handwritten_prior(Plane(16, 16, 0.005), 10, 1)
+    one = Condition("some", light=0.1, speed_m_s=0.08, ambient=0.5, shade=30.0)
+    light, setup = one.light_of(prior), one.setup
+    span = (0.0, one.asked.duration_s)
+    plain = sequence_light(setup, prior, one.asked.motion.position_m, span, setup.shape, fineness=2.0)
+    z = np.linspace(-1, 1, prior.count)
+    shade = one.shading().reshape(-1, 1)
+    np.testing.assert_allclose(light(z), plain(z) * shade, rtol=1e-5)
+    np.testing.assert_allclose(light.times_s, plain.times_s, rtol=1e-12)
+
+
+def test_the_brightest_light_of_letters_is_that_about_the_frames() -> None:
+    times = np.linspace(0.0, 1.0, 101)
+    right = np.stack([np.sin(9 * times), np.cos(5 * times)], axis=1)[:, None]
+    light = SequenceLight(np.array([[1.0], [2.0]]), right, np.full((2, 1), 0.1, np.float32), times, (1, 2))
+    letters = [np.array([0.3]), np.array([-0.4])]
+    frames = np.array([0.25, 0.5])
+    found = module.brightest_light(light, letters, frames)
+    expected = np.max([light(z)[:, [25, 26, 50, 51]] for z in letters], axis=(0, 2))
+    np.testing.assert_allclose(found, expected)
+
+
+def test_exposure_and_gain_are_those_of_training_letters_and_clip_no_pixel_that_counts(tmp_path) -> None:
+    even = Condition("even", frames=40)
+    chosen = [even, replace(even, name="shaded", shade=1000.0)]
+    plain, shaded = sweep_parameters(chosen, tmp_path, workers=1, characters="")
+    assert plain.left_out < 0.05 < shaded.left_out, "bright parts of a wall in shade may clip"
+    assert plain.exposure_s < shaded.exposure_s <= even.duration_s / 40 * (1 + 1e-6)
+    prior, setup = handwritten_prior(Plane(32, 32, 0.0025)), even.setup
+    light = even.light_of(prior)
+    camera, inside = module.tuned_camera(light, prior, setup, even.asked)
+    assert (round(camera.exposure_s, 6), camera.gain) == (plain.exposure_s, plain.gain)
+    exposed, scale = light.exposed(camera.exposure_s), camera.per_light().gain
+    for name in TRAIN_CHARACTERS[:5]:
+        glyphs = HandwritingGlyphs(characters=name, writers=1)
+        z = prior.coefficients(glyphs.target(glyphs.objects()[0]).rasterise(prior.target_plane))
+        frames = exposed(z)[:, 6:-6][:, ::6] * scale
+        assert frames[inside].max() < 0.9
+
+
+def test_a_ripple_costs_events_what_its_phase_is_unknown_by(tmp_path) -> None:
+    still = Condition("still", frames=2, speed_m_s=0.32)
+    unknown, known, wild = (
+        replace(still, name=name, ripple=ripple, is_ripple_known=known)
+        for name, ripple, known in (("unknown", 0.08, False), ("known", 0.08, True), ("wild", 0.2, False))
+    )
+    chosen = [still, unknown, known, wild]
+    found = sweep_parameters(chosen, tmp_path, workers=1, characters="")
+    events = [one.expected_db.get("events", (float("nan"),))[-1] for one in found]
+    assert events[1] < events[0] - 0.05 and events[2] == events[0]
+    assert list(found[3].expected_db) == ["frames"], "each ripple crosses thresholds: no bound"
+    assert found[3].expected_db["frames"] == found[0].expected_db["frames"]
+    row = conditions_table(found).splitlines()[-1].split(" | ")
+    assert row[4] == "-" and row[6:10] == ["- / -", "- / -", "- / -", "-"] and row[5].endswith(" / -")
+
+
 def test_light_sets_what_frames_and_events_are_worth(tmp_path) -> None:
     base = Condition("base", frames=5)
     chosen = [base, replace(base, name="dim", light=0.003), replace(base, name="lost", is_motion_known=False)]
@@ -47,6 +116,9 @@ def test_light_sets_what_frames_and_events_are_worth(tmp_path) -> None:
         assert all(
             b >= max(f, e) for f, e, b in zip(*(one.expected_db[k] for k in module.EVIDENCE), strict=True)
         )
+    assert [one.clipped for one in found] == [0, 0, 0]
+    assert bright.thinned_frames * 16 * 24 <= bright.event_bytes[0] or bright.thinned_frames == 1
+    assert bright.measured_db["frames thinned"][0] <= bright.measured_db["frames"][0] + 0.5
     assert dim.expected_db["frames"][-1] < bright.expected_db["frames"][-1] - 0.5
     assert dim.exposure_s > bright.exposure_s
     for name in module.EVIDENCE:

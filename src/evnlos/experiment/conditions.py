@@ -1,17 +1,18 @@
 """Where events win: frames and events of the same moving targets, over light, speed, shade, ripple and more.
 
 The best linear estimate says what each is worth, and simulated sequences what an estimate makes of it. Events
-are those of a true logarithm over a dark level; frames collect electrons over the best exposure, with the best
-gain.
+are those of a true logarithm over a dark level; frames collect electrons over the exposure, with the gain, that
+tell most of training letters. A pixel that any of those could clip counts neither in bounds nor in estimates.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.analysis import bounds
 from evnlos.analysis.scores import paired_difference
-from evnlos.cameras import EventCamera, EventPixel, FlickeringWall, FrameCamera
+from evnlos.cameras import CrossingLaw, EventCamera, EventPixel, FlickeringWall, FrameCamera
 from evnlos.config import config_hash, from_dict, to_dict
 from evnlos.data.pool import run_in_order
 from evnlos.files import write_atomically
@@ -34,9 +35,10 @@ from evnlos.inverse import (
     record_of,
     sequence_light,
 )
-from evnlos.inverse.prior import TEST_CHARACTERS
+from evnlos.inverse.prior import TEST_CHARACTERS, TRAIN_CHARACTERS
+from evnlos.inverse.sequence_problem import position_subsets
 from evnlos.machine import Progress, Step, silent
-from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Scene, Target
+from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, LineMotion, Scene, Target
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.setups.load import FAR_M
 from evnlos.types import Irradiance, Plane, derive_seed
@@ -62,12 +64,17 @@ _PIXEL = EventPixel(
     cutoff_floor_dn=28.0,  # a tenth of the bandwidth is left in the dark
 )
 _CAMERA = FrameCamera(electrons_per_s=1.5e6)  # white fills the well in 10 ms
+_BLACK = 1 / 16  # of white: four deviations of read noise and offset at the largest gain
 _SENSOR = SensorSize(50, 80)
 _TRAVEL_M, _FASTEST_HZ, _RIPPLE_HZ = 0.16, 100.0, 100.0
 _PLACE_M, _SPEED = 0.01, 0.1  # what an unknown motion may be off by: place, and share of the speed
 _CELLS = Plane(32, 32, 0.0025)
-_GAINS = tuple(2.0**k for k in range(8))
-_UNCLIPPED = 0.85  # of white: pixels that other targets leave below it
+_GAINS = tuple(2.0**k for k in range(6))  # at 32, rounding is a hundredth of the read noise's variance
+_STRIDE, _FACTORS = 4, 80  # rows and columns at which exposure and gain are chosen, and factors of their light
+_SHORTEST_S, _FINER = 1e-3, 1.25  # exposures that are tried: the shortest, and the ratio of two
+_ALIKE = 1e-3  # difference of errors, relative, that is none: the shortest exposure and least gain is taken
+_UNCLIPPED = 0.85  # of white: pixels that all training letters leave below it
+_TUNED_ON = "EMR"  # training letters whose error chooses exposure and gain
 _GAP = 0.05  # between the instants at which silences are looked at, share of the sequence
 _CROSSING_NOISE = 0.04  # error of a crossing beside the event model's own, log units
 
@@ -92,6 +99,8 @@ class Condition:
     """How much darker the wall is lit where it is darkest, in smooth patches."""
     ripple: float = 0.0
     """Amplitude of the lamps' ripple at 100 Hz, share of all light."""
+    is_ripple_known: bool = False
+    """Whether the estimate from events knows by how much the ripple carries crossings ahead."""
     is_motion_known: bool = True
     """Whether place and speed are known, or within 10 mm and a tenth."""
     roughness: float = 0.05
@@ -121,8 +130,33 @@ class Condition:
             roughness=self.roughness,
             distance_m=self.distance_m,
             sensor=_SENSOR,
-            frame_camera=replace(_CAMERA, bit_depth=self.bit_depth),
+            frame_camera=replace(_CAMERA, bit_depth=self.bit_depth, black_level=2**self.bit_depth * _BLACK),
             pixel=_PIXEL,
+        )
+
+    def light_of(self, prior: PatternPrior) -> SequenceLight:
+        """Return the light of the moving target on the shaded wall.
+
+        Args:
+            prior: Of the target.
+        """
+        light = _unit_light(replace(self.setup, gain=1.0, ambient=0.0), prior)
+        shade, times = (
+            self.shading().reshape(-1, 1),
+            light.times_s * (self.asked.duration_s / light.times_s[-1]),
+        )
+        still = (self.setup.ambient * shade).astype(np.float32)
+        return replace(light, left=light.left * shade * self.setup.gain, still=still, times_s=times)
+
+    def swing(self, law: CrossingLaw, light_dn: float) -> float:
+        """Return the amplitude that the lamps' ripple has behind the pixel's filter, log units.
+
+        Args:
+            law: The pixel's constants.
+            light_dn: The light, DN.
+        """
+        return self.ripple / math.hypot(
+            1.0, 2 * math.pi * _RIPPLE_HZ / float(law.bandwidth(np.array(light_dn)))
         )
 
     def shading(self) -> NDArray[np.float64]:
@@ -138,20 +172,27 @@ class Finding:
 
     Args:
         condition: The condition.
-        exposure_s: The best exposure of the frames, at most the time between two.
-        gain: Their best gain.
+        exposure_s: The exposure of the frames, at most the time between two.
+        gain: Their gain.
+        left_out: Share of the pixels that a training letter could clip: they do not count.
+        clipped: White values of the measured sequences' frames in pixels that count.
         counts: Numbers of positions.
         prior_db: PSNR of the prior's mean, dB.
-        expected_db: "frames", "events", "both" -> expected PSNR for each number of positions, dB.
-        measured_db: The same -> PSNR of simulated whole sequences, one a character, dB; empty without motion.
+        expected_db: "frames", "events", "both" -> expected PSNR for each number of positions, dB; frames alone
+            where the ripple itself makes events.
+        measured_db: The same, and "frames thinned" to the bytes of the events -> PSNR of simulated whole
+            sequences, one a character, dB; empty without motion.
         events_per_pixel: Events per pixel and sequence, noise among them.
         event_bytes: The events as 32-bit words, and packed (zlib), bytes.
         frame_bytes: The frames as they are, and packed, bytes.
+        thinned_frames: How many frames, equally spaced, take as many bytes as the events, mean.
     """
 
     condition: Condition
     exposure_s: float
     gain: float
+    left_out: float
+    clipped: int
     counts: tuple[int, ...]
     prior_db: float
     expected_db: dict[str, tuple[float, ...]]
@@ -159,6 +200,14 @@ class Finding:
     events_per_pixel: float
     event_bytes: tuple[int, int]
     frame_bytes: tuple[int, int]
+    thinned_frames: float
+
+
+@lru_cache(maxsize=2)
+def _unit_light(setup: RadiometricSetup, prior: PatternPrior) -> SequenceLight:
+    """Return the light of a way in one second; light and speed of a condition scale it."""
+    way = LineMotion((-_TRAVEL_M / 2, 0.0), _TRAVEL_M)
+    return sequence_light(setup, prior, way.position_m, (0.0, 1.0), setup.shape, fineness=2.0)
 
 
 def conditions() -> list[Condition]:
@@ -173,7 +222,8 @@ def conditions() -> list[Condition]:
         ),
         *(Condition(f"shade 1:{shade:g}", shade=shade) for shade in (30.0, 1000.0)),
         Condition("shade 1:1000, 12 bits", shade=1000.0, bit_depth=12),
-        *(Condition(f"ripple {100 * ripple:g} %", ripple=ripple) for ripple in (0.04, 0.08)),
+        *(Condition(f"ripple {100 * ripple:g} %", ripple=ripple) for ripple in (0.04, 0.08, 0.2)),
+        Condition("ripple 8 %, known", ripple=0.08, is_ripple_known=True),
         *(Condition(f"{count} frame{'s' * (count > 1)}", frames=count) for count in (10, 3, 1)),
         Condition("motion unknown", is_motion_known=False),
         Condition("motion unknown, 10 frames", frames=10, is_motion_known=False),
@@ -221,8 +271,11 @@ def sweep_parameters(
 def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
     """Return the bounds under a condition, and what simulated sequences give.
 
-    The best linear estimate (`evnlos.analysis.bounds`) sets the exposure and the gain of the frames: those with
-    which a few of them tell most. An unknown place (10 mm) and speed (a tenth) are two more unknowns.
+    The best linear estimate (`evnlos.analysis.bounds`) sets the exposure and the gain of the frames
+    (`tuned_camera`). An unknown place (10 mm) and speed (a tenth) are two more unknowns. A ripple of amplitude
+    a in filtered log light, its phase unknown, adds an error of a to each crossing, the difference of two
+    phases; known, it carries each crossing ahead by a (`CrossingLaw.ahead`), and adds none. Where it spans a
+    threshold it makes events itself, and they have neither a bound nor an estimate.
 
     Args:
         condition: The condition.
@@ -230,32 +283,26 @@ def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
     """
     setup, asked = condition.setup, condition.asked
     prior = handwritten_prior(_CELLS)
-    span = (0.0, asked.duration_s)
-    light = sequence_light(setup, prior, asked.motion.position_m, span, setup.shape, fineness=2.0)
-    shade = condition.shading().ravel()
-    light = replace(light, left=light.left * shade[:, None], still=light.still * shade[:, None])
+    light = condition.light_of(prior)
     glyphs = HandwritingGlyphs(characters=TEST_CHARACTERS, writers=1, first_writer=TRAIN_WRITERS)
     targets = {name[-1]: glyphs.target(name) for name in glyphs.objects()}
     references = [prior.coefficients(targets[one].rasterise(_CELLS)) for one in "AS2"]
-    few, slowest = min(asked.positions, 5), asked.duration_s / asked.positions
-    few = replace(asked, positions=few, counts=(few,))
-    tried = list[tuple[float, FrameCamera]]()
-    for exposure in np.geomspace(1e-4, slowest, 10).tolist():
-        blurred = light.exposed(exposure)
-        for gain in _GAINS:
-            camera = replace(_CAMERA, bit_depth=condition.bit_depth, exposure_s=exposure, gain=gain)
-            told = _of_frames(blurred, references[0], setup, camera, few)
-            tried.append((prior.error(told[0]), camera))
-    camera = min(tried, key=lambda one: one[0])[1]
+    camera, inside = tuned_camera(light, prior, setup, asked)
     unknown = () if condition.is_motion_known else motion_unknowns(light, references, asked)
     lights = unknown or [light] * len(references)
     law = _PIXEL.crossing_law(light.typical_dn)
-    found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in EVIDENCE}
+    swing = condition.swing(law, light.typical_dn)
+    names = EVIDENCE if 2 * swing < _PIXEL.finest_threshold else EVIDENCE[:1]
+    noises = (math.hypot(_CROSSING_NOISE, 0.0 if condition.is_ripple_known else swing),)
+    found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in names}
     for seen, z in zip(lights, references, strict=True):
         z = np.concatenate([z, np.zeros(seen.right.shape[2] - 1 - len(z))])
-        frames = _of_frames(seen.exposed(camera.exposure_s), z, setup, camera, asked)
-        events = bounds.event_information(seen, z, law, asked, (_CROSSING_NOISE,))[0][0]
-        for name, information in zip(EVIDENCE, (frames, events, frames + events), strict=True):
+        frames = _of_frames(_part(seen.exposed(camera.exposure_s), inside), z, setup, camera, asked)
+        each = {"frames": frames}
+        if "events" in names:
+            each["events"] = bounds.event_information(seen, z, law, asked, noises)[0][0]
+            each["both"] = frames + each["events"]
+        for name, information in each.items():
             found[name].append(np.stack([marginal_information(one, prior.count) for one in information]))
     expected = {
         name: tuple(
@@ -264,11 +311,9 @@ def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
         )
         for name, each in found.items()
     }
-    # Chosen by what they would show of other targets: pixels that did not clip are those whose noise was low.
-    brightest = np.max([light(z).max(axis=1) for z in references], axis=0)
-    inside = brightest * camera.per_light().gain < _UNCLIPPED
-    runs = [_sequence(condition, light, camera, inside, prior, targets[one]) for one in characters]
-    measured = {name: tuple(run[name] for run in runs) for name in EVIDENCE if condition.is_motion_known}
+    shown = (*names, "frames thinned") if condition.is_motion_known else ()
+    runs = [_sequence(condition, light, camera, inside, prior, targets[one], shown) for one in characters]
+    measured = {name: tuple(run[name] for run in runs) for name in shown}
     sizes = np.mean([run["bytes"] for run in runs], axis=0) if runs else np.zeros(4)
     per_pixel = float(sizes[0]) / EVENT_BYTES / len(light.left)
     sizes = [round(float(one)) for one in sizes]
@@ -276,6 +321,8 @@ def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
         condition,
         round(camera.exposure_s, 6),
         camera.gain,
+        round(1 - float(inside.mean()), 4),
+        sum(run["clipped"] for run in runs),
         asked.counts,
         round(bounds.canvas_decibel(prior.error(np.zeros((prior.count, prior.count))), _CELLS), 3),
         expected,
@@ -283,7 +330,77 @@ def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
         round(per_pixel, 3),
         (sizes[0], sizes[1]),
         (sizes[2], sizes[3]),
+        round(float(np.mean([run["thinned"] for run in runs])), 1) if runs else 0.0,
     )
+
+
+def tuned_camera(
+    light: SequenceLight, prior: PatternPrior, setup: RadiometricSetup, asked: bounds.SequenceAnalysisSettings
+) -> tuple[FrameCamera, NDArray[np.bool_]]:
+    """Return the camera whose exposure and gain tell most, and which pixels it never clips, [P].
+
+    Letters of the prior decide, none that is measured: three by the error that a few frames of every fourth
+    row and column leave, all of them by the light at which a pixel clips and is left out.
+
+    Args:
+        light: The light.
+        prior: The prior of its coefficients.
+        setup: The setup; its frame camera is tuned.
+        asked: The motion and its positions; a frame is exposed for the time between two at most.
+    """
+    few = min(asked.positions, 5)
+    few = replace(asked, positions=few, counts=(few,))
+    letters, usual = _training_letters(prior), setup.frame_camera
+    assert isinstance(usual, FrameCamera)
+    longest = asked.duration_s / asked.positions
+    steps = math.ceil(math.log(longest / _SHORTEST_S) / math.log(_FINER))
+    sampled, tried = light.every(_STRIDE, _FACTORS), list[tuple[float, FrameCamera]]()
+    for exposure in np.geomspace(_SHORTEST_S, longest, steps + 1).tolist():
+        blurred = sampled.exposed(exposure)
+        brightest = brightest_light(blurred, letters.values(), _instants(asked))
+        for gain in _GAINS:
+            camera = replace(usual, exposure_s=exposure, gain=gain)
+            part = _part(blurred, brightest * camera.per_light().gain < _UNCLIPPED)
+            told = [_STRIDE**2 * _of_frames(part, letters[one], setup, camera, few)[0] for one in _TUNED_ON]
+            tried.append((float(np.mean([prior.error(one) for one in told])), camera))
+    least = min(error for error, _ in tried)
+    camera = next(one for error, one in tried if error <= (1 + _ALIKE) * least)
+    brightest = brightest_light(light.exposed(camera.exposure_s), letters.values(), _instants(asked))
+    return camera, brightest * camera.per_light().gain < _UNCLIPPED
+
+
+@lru_cache(maxsize=2)
+def _training_letters(prior: PatternPrior) -> dict[str, NDArray[np.float64]]:
+    """Return the coefficients of all training characters in one hand, not that of the measured ones."""
+    glyphs = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=1)
+    return {name[-1]: prior.coefficients(glyphs.target(name).rasterise(_CELLS)) for name in glyphs.objects()}
+
+
+def brightest_light(
+    light: SequenceLight, letters: Iterable[NDArray[np.float64]], times_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the brightest light of each pixel about some instants, of all letters, white levels, [P].
+
+    Args:
+        light: The light.
+        letters: Their coefficients, [k] each.
+        times_s: The instants, [N], seconds.
+    """
+    node, _ = light.place(times_s)
+    about = np.union1d(node, node + 1)
+    still = light.still[:, about] if light.still.shape[1] > 1 else light.still
+    there = replace(light, right=light.right[about], still=still, times_s=light.times_s[about])
+    return np.max([there(z).max(axis=1) for z in letters], axis=0)
+
+
+def _instants(asked: bounds.SequenceAnalysisSettings) -> NDArray[np.float64]:
+    """Return the middles of the exposures, seconds: a frame at the end of each position."""
+    return np.arange(1, asked.positions + 1) * asked.duration_s / asked.positions
+
+
+def _part(light: SequenceLight, inside: NDArray[np.bool_]) -> SequenceLight:
+    """Return the light of some pixels."""
+    return replace(light, left=light.left[inside], still=light.still[inside], shape=(1, int(inside.sum())))
 
 
 def _of_frames(
@@ -334,6 +451,7 @@ def _sequence(
     inside: NDArray[np.bool_],
     prior: PatternPrior,
     target: Target,
+    names: Sequence[str],
 ) -> dict[str, Any]:
     """Return the PSNR of a simulated sequence for each kind of evidence, dB, and the bytes of recordings."""
     setup, asked = condition.setup, condition.asked
@@ -342,25 +460,26 @@ def _sequence(
     lit = FlickeringWall(wall, condition.ripple, _RIPPLE_HZ) if condition.ripple else wall
     seed = derive_seed(0, "conditions", target.name)
     events = EventCamera(setup.pixel).record(lit, *span, seed=seed)
-    times = np.arange(1, asked.positions + 1) * asked.duration_s / asked.positions
+    times = _instants(asked)
     frames = camera.capture(lit, times, seed)
     sensitivity, offset_e = camera.fixed_pattern(setup.shape, seed)  # known, as by calibration
-    seen = (frames / camera.dn_per_electron - offset_e) / (camera.white_e * sensitivity)
-    part = replace(light, left=light.left[inside], still=light.still[inside], shape=(1, int(inside.sum())))
-    term = FrameTerm(
-        part.exposed(camera.exposure_s),
-        seen.reshape(len(times), pixels)[:, inside],
-        times,
-        camera.per_light(),
-        known_pattern=True,
-    )
+    electrons = (frames - camera.black_level) / camera.dn_per_electron - offset_e
+    seen = (electrons / (camera.white_e * sensitivity)).reshape(len(times), pixels)[:, inside]
+    part = _part(light, inside).exposed(camera.exposure_s)
+    few = min(len(times), max(1, EVENT_BYTES * len(events) * len(times) // frames.nbytes))
+    kept = position_subsets(len(times), few, 1)[0]
+    term, thinned = (FrameTerm(part, seen[k], times[k], camera.per_light(), True) for k in (slice(None), kept))
     law = _PIXEL.crossing_law(light.typical_dn)
-    record = record_of(events, law, span, _GAP * asked.duration_s)
+    if condition.is_ripple_known:
+        law = replace(law, ahead=condition.swing(law, light.typical_dn))
+    record = record_of(events, law, span, _GAP * asked.duration_s) if "events" in names else None
     evidence = {"frames": (None, None, term), "events": (law, record, None), "both": (law, record, term)}
+    evidence["frames thinned"] = None, None, thinned
     truth = target.rasterise(_CELLS)
-    found: dict[str, Any] = {}
-    for name, known in evidence.items():
-        image = estimate_sequence(light, prior, *known).image
+    clipped = (frames.reshape(len(times), pixels)[:, inside] >= camera.white).sum()
+    found: dict[str, Any] = {"thinned": few, "clipped": int(clipped)}
+    for name in names:
+        image = estimate_sequence(light, prior, *evidence[name]).image
         found[name] = round(bounds.canvas_decibel(float(np.square(image - truth).mean()), _CELLS), 3)
     steps = np.diff(events.t_us, prepend=0) & 0xFFFF
     place = (2 * (events.y.astype(np.int64) * events.width + events.x) + events.p) & 0xFFFF
@@ -371,29 +490,47 @@ def _sequence(
 
 
 def conditions_table(findings: Sequence[Finding]) -> str:
-    """Return Markdown: a row a condition; of a cell "bound / measured" the whole sequence counts.
+    """Return Markdown: a row a condition; of a cell "bound / measured" the whole sequence counts; "-" = none.
 
     Args:
         findings: What came of each condition.
     """
-    head = ["condition", "frames", "exposure, gain", "frame, one", "events, one", "frames, all", "events, all"]
-    head += ["both, all", "events - frames, 95 % interval", "events per pixel", "events kB", "frames kB"]
+    head = ["condition", "frames", "exposure, gain", "frame, one: bound", "events, one: bound", "frames, all"]
+    head += [
+        "events, all",
+        "both, all",
+        "events - frames, 95 % interval",
+        "frames of the events' bytes; events - these",
+    ]
+    head += ["events per pixel", "events kB", "frames kB"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in findings:
-        cells = [one.condition.name, str(one.counts[-1]), f"{1e3 * one.exposure_s:.3g} ms, {one.gain:g}"]
-        cells += [f"{one.expected_db[name][0]:.1f}" for name in EVIDENCE[:2]]
+        bound, known = one.expected_db, one.measured_db
+        tuned = f"{1e3 * one.exposure_s:.3g} ms, {one.gain:g}"
+        cells = [one.condition.name, str(one.counts[-1]), tuned + (" *" if one.left_out else "")]
+        cells += [_decibel(bound.get(name, ())[:1]) for name in EVIDENCE[:2]]
         for name in EVIDENCE:
-            known = one.measured_db.get(name)
-            cells.append(f"{one.expected_db[name][-1]:.1f}" + (f" / {np.mean(known):.1f}" if known else ""))
-        gap = one.expected_db["events"][-1] - one.expected_db["frames"][-1]
-        if known := one.measured_db.get("events"):
-            names = np.arange(len(known)).astype(str)
-            gain = paired_difference(np.array(known), np.array(one.measured_db["frames"]), names)
-            cells.append(f"{gap:+.1f} / {gain.mean:+.1f} [{gain.low:+.1f}, {gain.high:+.1f}]")
-        else:
-            cells.append(f"{gap:+.1f}")
+            cells.append(f"{_decibel(bound.get(name, ())[-1:])} / {_decibel(known.get(name, ()))}")
+        lead = np.subtract(bound["events"][-1:], bound["frames"][-1:]) if "events" in bound else ()
+        cells.append(f"{_decibel(lead, '+')} / {_lead(known, 'frames')}")
+        thinned = f"{_decibel(known.get('frames thinned', ()))}; {_lead(known, 'frames thinned')}"
+        cells.append(f"{one.thinned_frames:.3g}: {thinned}" if known.get("frames") else "-")
         cells.append(f"{one.events_per_pixel:.1f}")
         sizes = one.event_bytes, one.frame_bytes
         cells += [f"{size / 1e3:.0f} ({packed / 1e3:.0f})" for size, packed in sizes]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _decibel(values: ArrayLike, sign: str = "") -> str:
+    """Return the mean of some decibels, or "-" of none."""
+    known = np.asarray(values, np.float64)
+    return f"{known.mean():{sign}.1f}" if known.size else "-"
+
+
+def _lead(known: dict[str, tuple[float, ...]], frames: str) -> str:
+    """Return by how much measured events lead frames, dB, with a 95 % interval, or "-" without events."""
+    if not (events := known.get("events")):
+        return "-"
+    found = paired_difference(events, known[frames], np.arange(len(events)).astype(str))
+    return f"{found.mean:+.1f} [{found.low:+.1f}, {found.high:+.1f}]"
