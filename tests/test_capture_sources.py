@@ -1,5 +1,6 @@
 """Loose recordings as a laboratory produces them become captures: every source of frames, clock and pixels."""
 
+import re
 import shutil
 import struct
 import tracemalloc
@@ -568,3 +569,12 @@ def test_a_video_with_a_tone_curve_is_read_as_light(tiny_captures, tmp_path) -> 
     (folder / "capture.yaml").write_text(text.replace("camera:\n", "camera:\n  tone: srgb\n", 1))
     found = read_capture(folder, needs_events=False)
     assert np.abs(found.frames / 257.0 - plain.frames).max() < 1.2
+    (folder / "shots").mkdir()
+    for k, frame in enumerate(plain.frames):
+        Image.fromarray(frame).save(folder / "shots" / f"{k:03d}.jpg", quality=95)
+    rate = 1e6 / np.diff(plain.frame_times_us).mean()
+    for tone, told in (("srgb", "srgb undone"), ("null", "taken as linear: most need camera: {tone: srgb}")):
+        about = text.replace("film.npy", "shots").replace("camera:\n", f"camera:\n  tone: {tone}\n", 1)
+        about = re.sub(r"frame_rate_hz: .*", f"frame_rate_hz: {rate}", about)
+        (folder / "capture.yaml").write_text(about)
+        assert [note for note in read_capture(folder, needs_events=False).notes if told in note]

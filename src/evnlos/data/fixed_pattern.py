@@ -134,6 +134,9 @@ def warp_frames(
     return out.astype(np.float32), covered
 
 
+_CODED = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+
+
 def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
     """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
     frames, notes, white, log = series.images, list[str](), info.camera.white_dn, info.camera.log
@@ -142,8 +145,11 @@ def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tupl
         notes.append(
             f"log frames made linear: {log.codes_per_efold:g} codes per e-fold, {log.white_code:g} white"
         )
-    if info.camera.tone:
-        notes.append(f"frames made linear: {info.camera.tone} undone")
+    path, camera = folder / (info.frames or ""), info.camera
+    if camera.tone:
+        notes.append(f"frames made linear: {camera.tone} undone")
+    elif log is None and (path.suffix.lower() in _CODED or next(path.glob("*.jp*g"), None)):
+        notes.append("frames of a video or as JPEG, taken as linear: most need camera: {tone: srgb}")
     size = frames.shape[1:]
     if white is not None and frames.dtype == np.uint8:
         raise DataError(f"{folder}: camera.white_dn is {white}, and frames have 8 bits; leave it out")
