@@ -107,7 +107,7 @@ class SetupFit:
         frame_doubt: By how much the variance of the frames' noise is raised when they are solved for a target.
         ink: Where the known targets have their ink.
         shown: What one frame shows of a target, whatever the method; None where that is not known.
-        curved: What `curvature` says of the frames held out.
+        curved: What `curvature` says of the frames held out; zeros where it can only be the wall's.
     """
 
     simulation: Simulation
@@ -256,6 +256,7 @@ def fit_setup(
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
     progress(Step("calibrate", len(stages), len(stages), "stages"))
+    about, curved = held.captures[0].info.camera, curvature(lit.numpy(), predicted["held out"].numpy())
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
     known, shown = dict[str, NDArray[np.float32]](), list[Target]()
     if settings.targets == "known":
@@ -280,7 +281,7 @@ def fit_setup(
         frame_doubt(held, optics.setup, noise) if is_any else 1.0,
         Ink.of(shown),
         Shown.by(simulation),
-        curvature(lit.numpy(), predicted["held out"].numpy()),
+        curved if curved[0] < 0 or about.tone or about.log else (0.0, 0.0),  # else it is the wall's
     )
 
 
