@@ -40,11 +40,12 @@ CELLS, COEFFICIENTS = 32, 240
 """Cells along a side of the target, patterns of its prior; what fewer leave out shines as errors do."""
 EVENT_ERRORS_FILE = "events.safetensors"
 """What captures showed of the errors of a calibrated setup, in its folder."""
+WORTH = 1.1
+"""How many times the events of when the target was last solved for make it worth solving for again."""
 
 _SPAN_US = 100_000  # first and last instant are multiples of it, so that clocks that jitter share a light path
 _FEWEST = 4  # captures that tell of errors
 _LEAST_GAIN_DB = 0.3
-_WORTH = 1.1  # times as many events as when the target was last solved for
 _LEAST = 1e-6  # noise of a coefficient, in the mean of all
 
 
@@ -384,7 +385,7 @@ def _worth_solving(seen: _Sequence) -> list[int]:
     counts = np.searchsorted(seen.events.t_us, np.round(1e6 * seen.instants_s), side="right")
     steps, last = list[int](), len(counts) - 1
     for step, count in enumerate(counts.tolist()):
-        if not steps or step == last or count > _WORTH * counts[steps[-1]]:
+        if not steps or step == last or count > WORTH * counts[steps[-1]]:
             steps.append(step)
     return steps
 

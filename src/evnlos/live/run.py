@@ -252,7 +252,7 @@ def _timed(chunks: Sequence[Chunk]) -> tuple[NDArray[np.float32] | None, float]:
     return _held.after(chunks), time.perf_counter() - began_s
 
 
-_WORTH, _FEWEST_EVENTS = 1.1, 500  # times as many events as the image before knew; for the first
+_FEWEST_EVENTS = 500  # for the first image
 
 
 class SoFar:
@@ -270,7 +270,10 @@ class SoFar:
     """
 
     def __init__(self, weights: Weights, *about: Any) -> None:
+        from evnlos.inverse.event_images import WORTH  # which compiles
+
         _check_sequence(weights)
+        self._worth = WORTH
         self._about, self._ending = (weights, *about), ExitStack()
         self._sees_events = weights.modality.needs_events
         self.seconds = list[float]()
@@ -295,7 +298,7 @@ class SoFar:
             self._waiting.append(chunk)
             self._count += len(chunk.events) if self._sees_events else chunk.frame is not None
         self._take_if_done()
-        least = max(_FEWEST_EVENTS, _WORTH * self._known) if self._sees_events else self._known + 1
+        least = max(_FEWEST_EVENTS, self._worth * self._known) if self._sees_events else self._known + 1
         if self._at_work is None and self._count >= least:
             self._begin_image()
 
