@@ -96,6 +96,8 @@ class ExperimentCommand:
     """Only these arms, by name; all by default."""
     sequence: bool = False
     """Networks that see all time steps of a sequence together, in an experiment of single time steps."""
+    keep_pattern: bool = False
+    """Leave the frame camera's fixed pattern in all frames, recorded and simulated ones, on captures."""
     test: tuple[str, ...] = ("G", "K", "4", "9")
     """Characters that nothing sees before the test."""
     validation: tuple[str, ...] = ()
@@ -182,19 +184,17 @@ class ExperimentCommand:
             raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
         study = experiment.STUDIES[self.name](self.captures_of)
         if self.writers and any(arm.writers for arm in study.arms):
-            raise ConfigError(
-                f"--writers {self.writers} would change nothing: {self.name} compares numbers of writers; "
-                "leave it out, or choose among its --arms"
-            )
+            why = f"{self.name} compares numbers of writers; leave it out, or choose among its --arms"
+            raise ConfigError(f"--writers {self.writers} would change nothing: {why}")
+        given = {name: getattr(self, name) for name in ("seeds", "test", "validation")}
         study = replace(
             study,
             arms=tuple(arm for arm in study.arms if not self.arms or arm.name in self.arms),
             modalities=tuple(p for p in study.modalities if p in self.modalities),
-            seeds=self.seeds,
-            test=self.test,
-            validation=self.validation,
             writers=self.writers or study.writers,
+            **given,
         )
+        study = study.with_pattern() if self.keep_pattern else study
         study = experiment.on_sequences(study) if self.sequence else study
         study = study.begun_with(self.start) if self.start else study
         return replace(study, arms=tuple(self._in_epochs(arm) for arm in study.arms))

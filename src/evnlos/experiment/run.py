@@ -276,7 +276,12 @@ def captures_of(root: Path, setup: str) -> list[Path]:
 def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     """Return the simulation that an arm is pre-trained on."""
     if arm.source == "calibrated":
-        config = load_yaml(Simulation, study.setup_folder(place.out) / "training.yaml")
+        folder = study.setup_folder(place.out)
+        config = load_yaml(Simulation, folder / "training.yaml")
+        if not study.correct_pattern:
+            camera = load_yaml(Simulation, calibrated_file(folder)).frame_camera
+            camera = replace(camera, pattern_seed=None)  # type: ignore[type-var]
+            config = replace(config, setup=replace(config.setup, frame_camera=camera))
         config = replace(config, setups=config.setups if study.setups is None else study.setups)
     else:
         config = study.simulation or default()
@@ -388,13 +393,6 @@ def folds_of(study: Study, folds: int, characters: Sequence[str]) -> list[Study]
         calibration = replace(study.calibration, exclude=(*study.calibration.exclude, *unseen))
         for part in own:
             number = parts.index(part) + 1
-            found.append(
-                replace(
-                    study,
-                    name=f"{study.name}-folds/{number}-of-{folds}",
-                    setup=f"{study.setup}-{name}",
-                    test=part,
-                    calibration=calibration,
-                )
-            )
+            own_name, own_setup = f"{study.name}-folds/{number}-of-{folds}", f"{study.setup}-{name}"
+            found.append(replace(study, name=own_name, setup=own_setup, test=part, calibration=calibration))
     return found

@@ -162,7 +162,8 @@ class Study:
     retrieval: bool = False
     """Also score the simulated object that explains the frames of a sequence best."""
     correct_pattern: bool = True
-    """Take the frame camera's fixed pattern, as the calibration found it, from all frames."""
+    """Take the frame camera's fixed pattern, as the calibration found it, from all frames; else the calibrated
+    simulation has it, another one for each object."""
 
     def __post_init__(self) -> None:
         if not self.arms or not self.modalities or not self.seeds:
@@ -195,6 +196,10 @@ class Study:
         if arms == list(self.arms):
             raise ConfigError(f"no network of {self.name} begins with layers {start!r}; those of sequence do")
         return replace(self, arms=tuple(arms))
+
+    def with_pattern(self) -> Study:
+        """Return the study of frames that keep the camera's fixed pattern, recorded and simulated."""
+        return replace(self, name=f"{self.name}-pattern", correct_pattern=False)
 
     @property
     def split(self) -> str:
