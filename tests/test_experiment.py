@@ -582,3 +582,32 @@ def test_simulated_objects_tell_the_confidence_where_others_are_drawn(place, mon
         with pytest.raises(DataError, match="enough"):
             run_study(replace(STUDY, arms=(arm,)), place)
     assert kept == [0.0, 0.3]
+
+
+def test_a_pattern_that_stays_is_in_captures_and_in_the_simulation(apart) -> None:
+    """The calibrated camera's own, not the little that stays after correction; another one for each object."""
+    setup = apart.out / "setups" / "lab"
+    fitted = load_yaml(Simulation, setup / "setup.yaml")
+    camera = replace(fitted.frame_camera, prnu=0.03, pattern_seed=7)
+    save_yaml(replace(fitted, setup=replace(fitted.setup, frame_camera=camera)), setup / "setup.yaml")
+    save_pattern(
+        FixedPattern(np.full((48, 72), 2, np.float32), np.zeros((48, 72), np.float32)),
+        setup / "pattern.safetensors",
+    )
+    study = replace(STUDY, modalities=("frame",), seeds=(0,), arms=ARMS[1:2])
+    new = [record for one in (study, study.with_pattern()) for record in run_study(one, apart)]
+    found = {record.study: record for record in new if record.arm == "simulation only"}
+    assert {"captures", "captures-pattern"} == set(found)
+    kept, taken = (
+        load_weights(apart.out / "runs" / found[name].settings["run"]).history[-1]["data"]["name"]
+        for name in ("captures-pattern", "captures")
+    )
+    told = {path.name: open_dataset(path).config["setup"] for path in (apart.out / "simulations").iterdir()}
+    assert (told[kept]["frame_camera"]["prnu"], told[kept]["frame_camera"]["pattern_seed"]) == (0.03, None)
+    assert told[taken]["frame_camera"]["prnu"] == fitted.frame_camera.prnu != 0.03
+    bright, dark = (
+        open_dataset(apart.out / "recorded" / found[name].settings["captures"])
+        for name in ("captures-pattern", "captures")
+    )
+    seen = [NlosDataset(one, "test", "frame").inputs.float().mean() for one in (bright, dark)]
+    assert seen[0] == pytest.approx(2 * float(seen[1]), rel=0.01)

@@ -356,11 +356,9 @@ class LiveCommand:
         out = self.out or (Path("live-out") if self.headless else None)
         if out is not None:
             check_folder(out)
-        name = self.weights
+        name, recorder, beside = self.weights, None, None
         model = None if name is None else load_model(name)
-        pattern = load_pattern(self.pattern) if self.pattern else None
-        source = open_live(self.source, self.listening, pattern)
-        recorder = None
+        source = open_live(self.source, self.listening, load_pattern(self.pattern) if self.pattern else None)
         try:
             with ExitStack() as stack:
                 if model is None:
@@ -369,7 +367,9 @@ class LiveCommand:
                     say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
                 engine = Engine(model.weights)
                 verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE, is_stated=False)
-                beside = None if self.so_far is None else so_far_of(self.so_far, self.source)
+                if self.so_far is not None:
+                    beside = so_far_of(self.so_far, self.source)
+                    say("what makes the images of all so far starts, which takes some seconds")
                 run = Run(source, engine, self.pace, so_far=beside)
                 sinks = []
                 if not self.headless:
