@@ -94,16 +94,16 @@ class SequenceLight:
         Args:
             exposure_s: Exposure time, seconds.
         """
-        right, still = np.zeros_like(self.right), np.zeros_like(self.still)
-        moves = self.still.shape[1] > 1
+        from scipy.sparse import coo_array  # scipy loads slowly
+
         offsets, weights = FrameCamera(exposure_s=exposure_s).instants(0.0)
-        for offset, weight in zip(offsets, weights, strict=True):
-            node, share = self.place(self.times_s + offset)
-            ends = share[:, None, None]
-            right += weight * ((1 - ends) * self.right[node] + ends * self.right[node + 1])
-            if moves:
-                still += weight * ((1 - share) * self.still[:, node] + share * self.still[:, node + 1])
-        return SequenceLight(self.left, right, still if moves else self.still, self.times_s, self.shape)
+        node, share = self.place(self.times_s + np.asarray(offsets)[:, None])  # [exposure, T]
+        shares = np.asarray(weights)[:, None] * np.stack([1 - share, share])
+        at, ends = np.broadcast_arrays(np.arange(len(self.times_s)), np.stack([node, node + 1]))
+        mixed = coo_array((shares.ravel(), (at.ravel(), ends.ravel())), 2 * (len(self.times_s),)).tocsr()
+        right = (mixed @ self.right.reshape(len(self.right), -1)).reshape(self.right.shape)
+        still = self.still if self.still.shape[1] == 1 else (mixed @ self.still.T).T.astype(np.float32)
+        return SequenceLight(self.left, right, still, self.times_s, self.shape)
 
     def place(self, t_s: Array) -> tuple[NDArray[np.int64], Array]:
         """Return of instants [N] the node before, and the share of the way to the next; clipped to the ends."""
