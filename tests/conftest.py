@@ -36,6 +36,11 @@ THOROUGH = (
     "test_app_upload.py::test_a_recording_is_shown[.h5]",
     "test_app_upload.py::test_a_recording_is_shown[.npz]",
     "test_capture_check.py::test_rates_of_false_alarms_and_of_shifts_that_are_found",
+    "test_capture_check.py::test_a_tenth_of_a_second_is_found_beside_other_captures[near]",
+    "test_circuit.py::test_noise_is_as_frequent_at_first_as_later[1e-14-0.15-0.15-0.0-0.0-3]",
+    "test_circuit.py::test_noise_is_as_frequent_at_first_as_later[1e-14-0.15-0.15-0.1-0.02-3]",
+    "test_circuit.py::test_noise_is_as_frequent_at_first_as_later[3e-15-0.1-0.1-0.1-0.02-3]",
+    "test_circuit.py::test_noise_is_as_frequent_at_first_as_later[1e-14-0.2-0.2-0.5-0.0-3]",
     "test_cluster.py::test_a_killed_worker_costs_nothing_but_time",
     "test_cluster.py::test_the_command_starts_a_cluster_of_its_own",
     "test_command_line.py::test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows[ascii]",
@@ -62,7 +67,7 @@ THOROUGH = (
     "test_mitsuba_oracle.py::test_two_per_cent_of_gain_are_found[GGX 0.3, post]",
     "test_tracking.py::test_approach_and_retreat_are_found[0.0]",
 )
-"""Tests, or files of them, that take long and repeat at another instant or format what a quicker one tests."""
+"""What takes long and repeats at another instant, format or number what a quicker test does."""
 
 
 BEGUN_SECOND = ("test_brownian", "test_circuit", "test_event_models")

@@ -68,14 +68,14 @@ def test_noise_rates_are_those_of_small_steps(threshold) -> None:
 
 
 @pytest.mark.parametrize(
-    ("current", "threshold", "hertz"),
-    [(1e-15, 0.15, 0.40), (1e-14, 0.15, 1.4), (1e-14, 0.2, 0.06), (1e-13, 0.15, 0.04)],
+    ("current", "threshold", "hertz", "pixels"),
+    [(1e-15, 0.15, 0.40, 150), (1e-14, 0.15, 1.4, 100), (1e-14, 0.2, 0.06, 500), (1e-13, 0.15, 0.04, 500)],
 )
-def test_noise_events_come_at_stated_rates(current, threshold, hertz) -> None:
+def test_noise_events_come_at_stated_rates(current, threshold, hertz, pixels) -> None:
     """Rates that were found with the equations elsewhere, by small steps from a reset: to a third."""
     pixel = replace(PLAIN, threshold_on=threshold, threshold_off=threshold)
-    frames, times = static(current, 8.0, 500, 8)
-    rate = len(sent(frames, times, pixel, seed=3)) / 4000
+    frames, times = static(current, 8.0, pixels, 8)
+    rate = len(sent(frames, times, pixel, seed=3)) / (8 * pixels)
     assert rate == pytest.approx(hertz, rel=1 / 3)
 
 
