@@ -279,7 +279,7 @@ def test_what_is_refused() -> None:
 def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["invert", "shot", "--setup", "main-near", "--from", "events", "--positions", "3"])
-    assert "--from takes sequences" in capsys.readouterr().err
+    assert "--from takes whole sequences" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("pixel", [PIXEL, NOISY, DIM], ids=["few noise events", "many", "slow noise"])

@@ -1,6 +1,7 @@
 """A path found from events alone: against the true path, and each derivative against finite differences."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -164,3 +165,24 @@ def test_the_command_follows_events_where_frames_are_left_out_or_absent(capture,
     assert not (tmp_path / "p.png").exists()
     main(["track", str(folder.parent / "alone"), "--setup", str(setup), "--out", str(tmp_path / "a.png")])
     assert " events alone" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("evidence", ["events", "frames"])
+def test_a_target_is_solved_from_a_path_that_nobody_stated(evidence, capture, tmp_path, capsys) -> None:
+    """An L, whose light's middle is far from the middle that the prior's letters have, loses 2 to 4 dB."""
+    folder, setup = capture
+    pytest.importorskip("matplotlib")
+    info = read_yaml(folder / "capture.yaml")
+    info["motion"] = None
+    unstated = shutil.copytree(folder, tmp_path / "unstated")
+    (unstated / "capture.yaml").write_text(yaml.safe_dump(info))
+    rows = []
+    for k, words in enumerate(([str(folder)], [str(folder), "--track"], [str(unstated)])):
+        out = ["--out", str(tmp_path / f"found{k}.png"), "--json"]
+        main(["invert", *words, "--setup", str(setup), "--from", evidence, *out])
+        rows += json.loads(capsys.readouterr().out)["rows"]
+    stated, tracked, found = rows
+    assert stated["psnr_db"] > 20 and 18 < tracked["psnr_db"] < stated["psnr_db"]
+    assert tracked["expected_db"] == pytest.approx(stated["expected_db"], abs=1.0)
+    assert "covered_90" in stated and "covered_90" not in tracked
+    assert found["psnr_db"] is None and found["side_m"] == tracked["side_m"] > stated["side_m"]

@@ -464,12 +464,10 @@ def test_a_track_in_pixels_needs_no_setup(registered) -> None:
     frames = ambient() + blobs(PLACES) + 2e-3 * np.random.default_rng(5).standard_normal((12, *SHAPE))
     track = track_frames(frames, np.linspace(0, 1.1, 12))
     assert track.unit == "px" and track.event_windows == 0
-    np.testing.assert_allclose(track.at(track.time_s), track.position, atol=1e-12)
+    np.testing.assert_allclose(track.motion.position_m(track.time_s), track.position, atol=1e-12)
     truth = PLACES - PLACES.mean(axis=0)
     np.testing.assert_allclose(track.position, truth, atol=0.1)
     assert json.loads(json.dumps(track.summary()))["unit"] == "px"
-    with pytest.raises(DataError, match="ask within"):
-        track.at(2.0)
 
 
 def test_speed_and_direction() -> None:

@@ -30,7 +30,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, counted, note, silent
 from evnlos.metrics import psnr
 from evnlos.models import ConfidenceReport, Reconstructor, Weights, load_weights, published_setup
-from evnlos.scene import Motion, PathMotion
+from evnlos.scene import Motion
 from evnlos.setups import Setup, load_setup
 
 _SAME_LIGHT = (0.75, 1.33)
@@ -235,8 +235,7 @@ def _path_of(capture: Capture, setup: Setup, pattern: FixedPattern | None) -> tu
     from evnlos.tracking import track_capture, track_warnings
 
     track = track_capture(capture, setup, pattern=pattern)
-    points = tuple((x, y) for x, y in track.position.tolist())
-    return PathMotion(tuple(track.time_s.tolist()), points), track_warnings(capture, setup, track)
+    return track.motion, track_warnings(capture, setup, track)
 
 
 def setup_for_track(setup: Setup | None) -> Setup:

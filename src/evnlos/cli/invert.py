@@ -290,11 +290,13 @@ class InvertCommand:
         from evnlos.cli.invert_captures import estimate_captures, sequence_text
         from evnlos.plot.results import draw_inversion, estimate_panels
 
-        if self.positions or self.track or self.solver != "all":
-            raise ConfigError("--from takes sequences of known motion; leave --positions, --track, --solver")
+        if self.positions or self.solver != "all":
+            raise ConfigError("--from takes whole sequences and a prior; leave --positions, --solver")
+        if self.track and self.colours:  # each colour would be centred on its own light
+            raise ConfigError("--colours needs a motion that is known; leave it or --track")
         with ProgressBars() as progress:
             how = evidence, self.pattern, self.samples
-            found, pictures = estimate_captures(self.files, setup, *how, progress, self.colours)
+            found, pictures = estimate_captures(self.files, setup, *how, progress, self.colours, self.track)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
         panels, side_m = estimate_panels(found["rows"], pictures)

@@ -187,18 +187,24 @@ def _by_motion(
             if options.colour is not None:  # each colour would be centred on its own light
                 cure = "state it in capture.yaml (`evnlos track` finds it), and leave --track"
                 raise ConfigError(f"{capture.name}: --colours needs a motion that is known; {cure}")
-            from evnlos.tracking import track_capture, track_warnings
-
             progress(Step("track", k, len(captures), "captures", within=capture.name))
-            found = track_capture(capture, setup)
-            for warning in track_warnings(capture, setup, found):
-                say(f"warning: {capture.name}: {warning}")
-            motion = found.at(capture.frame_times_us[1:] * 1e-6)
+            way = _followed(capture, setup).path
         else:
-            assert capture.motion is not None  # else it would be tracked
-            motion = capture.motion.in_its_plane().position_m(capture.frame_times_us[1:] * 1e-6)
+            way = capture.motion and capture.motion.in_its_plane()
+        assert way is not None  # what states no motion is tracked
+        motion = way.position_m(capture.frame_times_us[1:] * 1e-6)
         groups.setdefault(motion.tobytes(), (motion, []))[1].append(k)
     return list(groups.values())
+
+
+def _followed(capture: Capture, setup: Setup, *, by_frames: bool = True) -> Capture:
+    """Return a capture with the path that its frames, or its events alone, show; say where it may be wrong."""
+    from evnlos.tracking import Tracking, track_capture, track_warnings
+
+    found = track_capture(capture, setup, Tracking(frames=by_frames))
+    for warning in track_warnings(capture, setup, found):
+        say(f"warning: {capture.name}: {warning}")
+    return replace(capture, path=found.motion)
 
 
 def _is_tracked(capture: Capture, options: SequenceOptions) -> bool:
@@ -230,13 +236,8 @@ def invert_stills(
     clock = time.perf_counter()
     operator, image = stills_as_scanned(files, setup, options.dark, options.bin)
     degree = chosen_degree(operator, image) if options.degree is None else options.degree
-    found: dict[str, Any] = {
-        "files": [str(path) for path in files],
-        "setup": setup.wall_description(),
-        "wall": list(operator.shape),
-        "background_degree": degree,
-        "solutions": {},
-    }
+    found: dict[str, Any] = {"files": [str(path) for path in files], "setup": setup.wall_description()}
+    found |= {"wall": list(operator.shape), "background_degree": degree, "solutions": {}}
     images: dict[str, torch.Tensor] = {}
     inversion = Inversion(operator, image, degree)
     for name in options.solvers:
@@ -269,11 +270,12 @@ def estimate_captures(
     samples: int = 0,
     progress: Progress = silent,
     colours: bool = False,
+    track: bool = False,
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and of each capture the target [cells, cells] and its standard deviation, by name.
 
     Args:
-        folders: Capture folders of one setup, whose motion is stated.
+        folders: Capture folders of one setup.
         word: Their setup.
         evidence: What the likelihood is made of.
         pattern: Fixed pattern of the frame camera, by default the one in the setup's folder; without any an
@@ -281,6 +283,7 @@ def estimate_captures(
         samples: Samples under the learned prior; 0: the Gaussian prior, without any.
         progress: Called as each capture is done.
         colours: Whether the target is solved in red, green and blue: [3, cells, cells].
+        track: Whether the motion is found, by frames where they count, also where it is stated.
 
     Raises:
         ConfigError: The setup is not linear or has no law of events, a motion is unknown, or colours are grey.
@@ -291,6 +294,9 @@ def estimate_captures(
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
         seen = _read_colours(folder, evidence) if colours else {None: capture_of(folder, evidence)}
+        one = seen.get(None)
+        if one is not None and (track or one.motion is None):
+            seen = {None: _followed(one, setup, by_frames=evidence != "events")}
         each = [estimate_target(one, setup, *how, colour) for colour, one in seen.items()]
         parts = [_row(*pair) for pair in zip(seen.values(), each, strict=True)]
         rows.append(_row_of_colours(parts) if colours else parts[0])
@@ -330,10 +336,10 @@ def _row_of_colours(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def _row(capture: Capture, found: TargetEstimate) -> dict[str, Any]:
     """Return the figures of a capture."""
-    assert capture.motion is not None
-    size = found.plane.pitch_m * found.plane.width
-    motion = capture.motion.position_m(capture.frame_times_us[1:] * 1e-6)
-    seen, data = scored_sampling(size, motion), found.likelihood
+    way = capture.path or capture.motion
+    assert way is not None
+    size, motion = found.plane.pitch_m * found.plane.width, way.position_m(capture.frame_times_us[1:] * 1e-6)
+    seen, data = scored_sampling(capture.info.target_size_m, motion), found.likelihood
     row: dict[str, Any] = {
         "capture": capture.name,
         "psnr_db": target_psnr(capture, torch.from_numpy(found.image), size, motion),
@@ -341,7 +347,7 @@ def _row(capture: Capture, found: TargetEstimate) -> dict[str, Any]:
         "level": _level(capture, torch.from_numpy(found.image), found.plane),
         "side_m": size,
     }
-    if capture.target is not None:
+    if capture.target is not None and capture.path is None:  # a path is that of the light's middle
         truth = _truth(capture, found.plane).numpy()
         row["covered_90"] = round(float(((truth >= found.low) & (truth <= found.high)).mean()), 3)
     if found.samples is not None:

@@ -51,12 +51,14 @@ from evnlos.inverse import (
     estimate_event_film,
     estimate_film,
     estimate_sequence,
+    handwritten_prior,
     record_of,
 )
-from evnlos.inverse.event_images import COEFFICIENTS, event_prior
+from evnlos.inverse.event_images import CELLS, COEFFICIENTS, event_prior
 from evnlos.machine import Progress, note, silent
 from evnlos.models.unet import ResidualUNet, UNetConfig
 from evnlos.models.weights import weights_folders
+from evnlos.scene import Ink
 from evnlos.setups import Setup
 from evnlos.tensor_file import TensorFile
 from evnlos.types import Colour, Plane
@@ -71,6 +73,7 @@ _TOGETHER = 32  # samples that the network sees at a time
 _PATTERNS = 120  # of a target: all that a minute of a core allows where events are solved in full
 _GAP_S = 0.4  # between the instants at which silences are looked at
 _NORMAL_90 = 1.645
+_ROOM = 1.25  # of the side of a target that was tracked
 _BESIDE = 0.02  # an interval of samples is widened by it: what is dark for sure is no interval of width 0
 OPEN = 0.2
 """Width of an interval, brightness, from which a cell counts as left open."""
@@ -316,6 +319,9 @@ def estimate_target(
 ) -> TargetEstimate:
     """Return the target of a capture whose motion is known, from the one likelihood of its whole sequence.
 
+    A motion that was found (`capture.path`) is that of the light's middle, which need not be the target's: the
+    plane is then larger by a quarter.
+
     A colour is solved from the pixels that see it alone, which have its share of the light of a wall that is
     grey. Of frames its brightness is that over the white balance, of events that over the ambient light of the
     same colour: a logarithm knows no other unit.
@@ -334,10 +340,15 @@ def estimate_target(
         ConfigError: The motion is unknown, the event model states no law of its crossings, or no event pixel
             has a filter of the colour.
     """
-    if (motion := capture.motion) is None:
+    motion, size = capture.path, capture.info.target_size_m
+    patterns = _PATTERNS if prior is None or evidence != "frames" else COEFFICIENTS
+    if motion is not None:
+        plane = Plane(CELLS, CELLS, _ROOM * size / CELLS)
+        basis = handwritten_prior(plane, patterns, ink=setup.ink if setup.ink.size_m else Ink(size))
+    elif capture.motion is not None:
+        motion, basis = capture.motion.in_its_plane(), event_prior(setup, size, patterns)
+    else:
         raise ConfigError(f"{capture.name}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
-    motion, size = motion.in_its_plane(), capture.info.target_size_m
-    basis = event_prior(setup, size, _PATTERNS if prior is None or evidence != "frames" else COEFFICIENTS)
     times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
     span, shape = (float(times[0]), float(times[-1])), (capture.events.height, capture.events.width)
     light = (lights or SequenceLights()).of(setup.seen_by(shape), basis, motion, span, shape)

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from evnlos.data.capture import Capture
 from evnlos.errors import DataError
-from evnlos.scene import Scene
+from evnlos.scene import PathMotion, Scene
 from evnlos.setups import Setup
 
 _LIKELY = np.logspace(-3, 3, 25)  # of (spread of the positions / duration^1.5)^2
@@ -273,25 +273,10 @@ class Track:
         """Direction of the velocity, [T], degrees from x (right) towards y (down); meaningless at rest."""
         return np.degrees(np.arctan2(self.velocity[:, 1], self.velocity[:, 0]))
 
-    def at(self, t_s: ArrayLike) -> NDArray[np.float64]:
-        """Return the position at times within the track, [..., 2], by cubic Hermite curves through it.
-
-        Raises:
-            DataError: A time lies outside the track.
-
-        Args:
-            t_s: Times, seconds, any shape [...].
-        """
-        times = np.asarray(t_s, dtype=np.float64)
-        low, high = float(self.time_s[0]), float(self.time_s[-1])
-        if not bool(((times >= low - 1e-9) & (times <= high + 1e-9)).all()):
-            raise DataError(f"the track runs from {low:g} to {high:g} s; ask within it")
-        k = np.clip(np.searchsorted(self.time_s, times, side="right") - 1, 0, len(self) - 2)
-        step = (self.time_s[k + 1] - self.time_s[k])[..., None]
-        u = (times - self.time_s[k])[..., None] / step
-        rise = self.position[k + 1] - self.position[k]
-        bend = step * (self.velocity[k] * u * (1 - u) ** 2 - self.velocity[k + 1] * u**2 * (1 - u))
-        return self.position[k] + rise * u**2 * (3 - 2 * u) + bend
+    @property
+    def motion(self) -> PathMotion:
+        """The path through the positions, in `unit`, upright at the setup's own distance."""
+        return PathMotion(tuple(self.time_s.tolist()), tuple((x, y) for x, y in self.position.tolist()))
 
     def errors(self, scene: Scene) -> dict[str, Any]:
         """Return how far a track in metres is from the truth: rms about the mean error, which is the offset.
