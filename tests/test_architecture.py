@@ -130,6 +130,7 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",
     "data/frames.py",
+    "data/simulate.py",
     "events/batch.py",
     "events/files/aedat.py",
     "experiment/conditions.py",
