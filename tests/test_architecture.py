@@ -139,6 +139,7 @@ WHOLE_CHAPTERS = {
     "inverse/event_likelihood.py",
     "lab/light_path.py",
     "live/run.py",
+    "models/drawn.py",
     "models/posterior.py",
     "models/sequence.py",
     "optics/corner.py",
