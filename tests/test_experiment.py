@@ -444,6 +444,7 @@ def test_wrong_plans_are_refused(tmp_path) -> None:
 def test_presets_are_whole(name) -> None:
     study = STUDIES[name]("near")
     assert study.name == name and study.test == ("G", "K", "4", "9") and len(study.arms) >= 2
+    assert set(study.asked_for) < {arm.name for arm in study.arms}
 
 
 @pytest.mark.parametrize("name", ["frozen", "capture-count", "surface", "thresholds", "loss", "width"])

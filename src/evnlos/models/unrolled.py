@@ -211,7 +211,7 @@ class UnrolledEvents(nn.Module):
             seen * (1 - seen),
             seen.logit(),
         )  # the odds of a part are g p; the weight is what they tell
-        strength = torch.zeros(len(seen), dtype=torch.float64)
+        strength, powers = torch.zeros(len(seen), dtype=torch.float64), odds[0]
         for _ in range(_ROUNDS):
             powers = (weight * (odds - strength[:, None])).sum(dim=0) / weight.sum(dim=0)
             strength = (weight * (odds - powers)).sum(dim=1) / weight.sum(dim=1)
@@ -325,7 +325,7 @@ class UnrolledReconstructor(SequenceReconstructor):
             )
         self.events = UnrolledEvents(self.sampling) if self.embedding.images else None
         steps = [f"unet.steps.{number}." for number in range(settings.steps)]
-        self.parts = {
+        self.parts = {  # type: ignore[misc]
             part: tuple(step + name.removeprefix("unet.") for step in steps for name in names)
             for part, names in PARTS.items()
         }
