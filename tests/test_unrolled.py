@@ -17,7 +17,6 @@ from evnlos.inverse import EVENT_ERRORS, EVENT_ERRORS_FILE, AboutErrors, event_p
 from evnlos.inverse.sequence_light import EVENT_PRIORS
 from evnlos.models import UnrolledConfig, UnrolledReconstructor, Weights, load_weights, save_weights
 from evnlos.models.drawn import TargetGrid
-from evnlos.models.unrolled import UnrolledEvents, UnrolledFrames
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup, load_setup
 from evnlos.training import Training
@@ -45,7 +44,8 @@ def gradient(information: torch.Tensor, score: torch.Tensor, z: torch.Tensor) ->
 
 def test_scores_of_frames_are_gradients_of_their_likelihood() -> None:
     torch.manual_seed(0)
-    grid, frames = TargetGrid(SAMPLING), UnrolledFrames(SAMPLING, (0.3, 3.0), 50)
+    network = NET.build("frame", SAMPLING)
+    grid, frames = network.grid, network.frames
     axes = torch.linalg.qr(torch.randn(1024, 150)).Q.T
     frames.patterns.copy_((axes * torch.logspace(0.5, -0.5, 150)[:, None]).view(150, 32, 32))
     frames.mean.copy_(torch.rand(32, 32))
@@ -105,7 +105,7 @@ def dataset(behind, tmp_path_factory):
 def test_scores_of_events_are_gradients_with_the_information_of_targets_as_bright(behind) -> None:
     sampling = replace(SAMPLING, setup=str(behind))
     grid, prior = TargetGrid(sampling), event_prior(load_setup(str(behind)), 0.08)
-    events = UnrolledEvents(sampling)
+    events = NET.build("event", sampling).events
     events.fit(sampling)
     torch.testing.assert_close(events.law[1], torch.tensor(-1.5), atol=0.02, rtol=0)
     targets = torch.rand(2, 32, 32) * torch.tensor([0.3, 0.7])[:, None, None]
@@ -154,8 +154,7 @@ def test_an_untrained_network_returns_the_solved_image(behind) -> None:
 @pytest.fixture(scope="module", params=MODALITIES)
 def trained(request, dataset, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("evnlos.models.drawn.TRAIN_WRITERS", 3)
-        patch.setattr("evnlos.models.drawn._POPULATIONS", 1)
+        patch.setattr("evnlos.models.drawn.TRAIN_WRITERS", 1)
         out = tmp_path_factory.mktemp("run") / request.param
         return train(dataset, replace(PLAN, modality=request.param), out)
 

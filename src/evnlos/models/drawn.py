@@ -99,7 +99,7 @@ class TargetGrid:
         kept: Tensor,
         images_of: Callable[[Tensor], Tensor] | None,
     ) -> Tensor | None:
-        """Return what subsets of the time steps show, [K, S, P, P]: the mean of those that see a pixel.
+        """Return what subsets of the time steps show, [K, S, P, P]; a pixel is the mean where it is seen.
 
         Args:
             inputs: What was recorded, [N, C, H, W].
