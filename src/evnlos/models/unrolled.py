@@ -207,10 +207,7 @@ class UnrolledEvents(nn.Module):
         covariance = torch.linalg.inv(information + own)
         axes = torch.linalg.eigh(covariance.mean(dim=0)).eigenvectors[:, :_MODES]  # those of least variance
         seen = 1 - torch.einsum("km,ckl,lm->cm", axes, covariance, axes).clamp(_SEEN_PART, 1 - _SEEN_PART)
-        weight, odds = (
-            seen * (1 - seen),
-            seen.logit(),
-        )  # the odds of a part are g p; the weight is what they tell
+        odds, weight = seen.logit(), seen * (1 - seen)  # ln (g p) of each, and what it tells of g and p
         strength, powers = torch.zeros(len(seen), dtype=torch.float64), odds[0]
         for _ in range(_ROUNDS):
             powers = (weight * (odds - strength[:, None])).sum(dim=0) / weight.sum(dim=0)
