@@ -178,7 +178,7 @@ _SEQUENCE_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
 _DRAWN_PRETRAINING = replace(
     _SEQUENCE, epochs=16, drawn=2272, network=replace(_SEQUENCE_NETWORK, frames="likelihood")
 )
-_UNROLLED_PRETRAINING = replace(_DRAWN_PRETRAINING, network=UnrolledConfig(rank=_SEQUENCE_NETWORK.rank))
+_UNROLLED = UnrolledConfig(rank=_SEQUENCE_NETWORK.rank)
 _DRAWN_FINETUNING = replace(_SEQUENCE_FINETUNING, epochs=20, learning_rate=5e-4, drawn=378)
 
 
@@ -190,7 +190,7 @@ def sequence(setup: str) -> Study:
     most likely through it, and learns from newly drawn targets: what is simulated tells light path, noise and
     scale. Both E2E have exact further captures, too. Unrolled networks are trained where they are asked for.
     """
-    sees = Sampling(surface="likelihood")
+    sees, in_steps = Sampling(surface="likelihood"), replace(_DRAWN_PRETRAINING, network=_UNROLLED)
     arms = (
         Arm("E2E, single positions", "none", None, END_TO_END),
         Arm("E2E, single positions, augmented", "none", None, END_TO_END, augment=True),
@@ -198,8 +198,8 @@ def sequence(setup: str) -> Study:
         Arm("E2E sequence, augmented", "none", None, replace(_SEQUENCE, epochs=60), augment=True),
         Arm("simulation only sequence", "calibrated", _DRAWN_PRETRAINING, None, sampling=sees),
         Arm("EPNP sequence", "calibrated", _DRAWN_PRETRAINING, _DRAWN_FINETUNING, sampling=sees),
-        Arm("simulation only unrolled", "calibrated", _UNROLLED_PRETRAINING, None, sampling=sees),
-        Arm("EPNP unrolled", "calibrated", _UNROLLED_PRETRAINING, _DRAWN_FINETUNING, sampling=sees),
+        Arm("simulation only unrolled", "calibrated", in_steps, None, sampling=sees),
+        Arm("EPNP unrolled", "calibrated", in_steps, _DRAWN_FINETUNING, sampling=sees),
     )
     asked_for = "simulation only unrolled", "EPNP unrolled"
     return Study("sequence", setup, arms, asked_for=asked_for, writers=2, average=True, retrieval=True)

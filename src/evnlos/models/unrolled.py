@@ -47,10 +47,10 @@ class UnrolledConfig(SequenceConfig):
     """Kind of the reconstructor."""
     frames: Literal["embedding", "likelihood"] = "likelihood"
     """How frames become images of the target: by the `likelihood` alone, from which the steps go."""
-    width: int = 24
+    width: int = 32
     """Channels at the finest level of each step's U-Net; they double at each level down, up to 8 times."""
-    steps: int = 4
-    """Steps, each with a network of its own."""
+    steps: int = 2
+    """Steps, each with a network of its own; chosen with the width on validation characters."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
