@@ -268,7 +268,7 @@ def test_a_study_begins_with_layers_where_its_networks_are_like_them() -> None:
     begun = {arm.name: arm for arm in study.begun_with("generic").arms}
     for before in study.arms:
         arm = begun[before.name]
-        if before.pretraining is None:  # end to end
+        if before.pretraining is None or before.name in study.asked_for:  # end to end, or of another kind
             assert arm == before
         else:
             assert arm.start == "generic" and arm.first_training("frame").refit_embedding
@@ -444,6 +444,7 @@ def test_wrong_plans_are_refused(tmp_path) -> None:
 def test_presets_are_whole(name) -> None:
     study = STUDIES[name]("near")
     assert study.name == name and study.test == ("G", "K", "4", "9") and len(study.arms) >= 2
+    assert set(study.asked_for) < {arm.name for arm in study.arms}
 
 
 @pytest.mark.parametrize("name", ["frozen", "capture-count", "surface", "thresholds", "loss", "width"])

@@ -11,8 +11,8 @@ from evnlos import EvnlosError, train
 from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import NlosDataset, live_dataset
-from evnlos.data.live import epoch_settings
 from evnlos.data.pool import run_in_order
+from evnlos.data.simulate import epoch_settings
 from evnlos.errors import ConfigError
 from evnlos.models import UNetConfig, load_weights
 from evnlos.training import Training

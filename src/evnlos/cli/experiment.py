@@ -93,7 +93,7 @@ class ExperimentCommand:
     modalities: tuple[str, ...] = STANDARD_MODALITIES
     """What the networks see."""
     arms: tuple[str, ...] = ()
-    """Only these arms, by name; all by default."""
+    """Only these arms, by name; by default all, but of sequence those of unrolled networks."""
     sequence: bool = False
     """Networks that see all time steps of a sequence together, in an experiment of single time steps."""
     keep_pattern: bool = False
@@ -186,13 +186,13 @@ class ExperimentCommand:
         if self.writers and any(arm.writers for arm in study.arms):
             why = f"{self.name} compares numbers of writers; leave it out, or choose among its --arms"
             raise ConfigError(f"--writers {self.writers} would change nothing: {why}")
-        given = {name: getattr(self, name) for name in ("seeds", "test", "validation")}
+        asked = self.arms or [arm.name for arm in study.arms if arm.name not in study.asked_for]
         study = replace(
             study,
-            arms=tuple(arm for arm in study.arms if not self.arms or arm.name in self.arms),
+            arms=tuple(arm for arm in study.arms if arm.name in asked),
             modalities=tuple(p for p in study.modalities if p in self.modalities),
             writers=self.writers or study.writers,
-            **given,
+            **{name: getattr(self, name) for name in ("seeds", "test", "validation")},
         )
         study = study.with_pattern() if self.keep_pattern else study
         study = experiment.on_sequences(study) if self.sequence else study

@@ -13,8 +13,6 @@ from .fixed_pattern import load_pattern as load_pattern
 from .fixed_pattern import object_light as object_light
 from .fixed_pattern import pattern_of as pattern_of
 from .fixed_pattern import save_pattern as save_pattern
-from .live import LiveDataset as LiveDataset
-from .live import live_dataset as live_dataset
 from .loader import MODALITIES as MODALITIES
 from .loader import STANDARD_MODALITIES as STANDARD_MODALITIES
 from .loader import ChannelGroup as ChannelGroup
@@ -28,8 +26,10 @@ from .sampling import Sampling as Sampling
 from .sampling import character_of as character_of
 from .sampling import make_samples as make_samples
 from .sampling import reduce_by_area as reduce_by_area
+from .simulate import LiveDataset as LiveDataset
 from .simulate import SensorSize as SensorSize
 from .simulate import Simulation as Simulation
+from .simulate import live_dataset as live_dataset
 from .simulate import simulate as simulate
 from .simulate import simulate_object as simulate_object
 from .simulations import randomized as randomized

@@ -14,12 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evnlos.analysis.confidence import (
-    ConfidenceCheck,
-    FrameOperator,
-    check_confidence,
-    consistent,
-)
+from evnlos.analysis.confidence import ConfidenceCheck, FrameOperator, check_confidence, consistent
 from evnlos.calibration.transport_fit import values_of
 from evnlos.config import config_hash, from_dict, load_yaml, to_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
@@ -29,7 +24,7 @@ from evnlos.experiment.study import Arm, Study
 from evnlos.experiment.table import TRUST
 from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
-from evnlos.models import SequenceConfig, UNetConfig, Weights, load_weights
+from evnlos.models import SequenceConfig, UNetConfig, UnrolledConfig, Weights, load_weights
 from evnlos.models.confidence import on_canvas
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
@@ -183,6 +178,7 @@ _SEQUENCE_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
 _DRAWN_PRETRAINING = replace(
     _SEQUENCE, epochs=16, drawn=2272, network=replace(_SEQUENCE_NETWORK, frames="likelihood")
 )
+_UNROLLED = UnrolledConfig(rank=_SEQUENCE_NETWORK.rank)
 _DRAWN_FINETUNING = replace(_SEQUENCE_FINETUNING, epochs=20, learning_rate=5e-4, drawn=378)
 
 
@@ -192,9 +188,9 @@ def sequence(setup: str) -> Study:
     A sequence is one sample. The images of an end-to-end network of single positions, aligned and averaged, are
     the stronger E2E. What knows the calibrated light path sees the target that all frames, and all events, make
     most likely through it, and learns from newly drawn targets: what is simulated tells light path, noise and
-    scale. Both E2E have exact further captures, too.
+    scale. Both E2E have exact further captures, too. Unrolled networks are trained where they are asked for.
     """
-    sees = Sampling(surface="likelihood")
+    sees, in_steps = Sampling(surface="likelihood"), replace(_DRAWN_PRETRAINING, network=_UNROLLED)
     arms = (
         Arm("E2E, single positions", "none", None, END_TO_END),
         Arm("E2E, single positions, augmented", "none", None, END_TO_END, augment=True),
@@ -202,8 +198,11 @@ def sequence(setup: str) -> Study:
         Arm("E2E sequence, augmented", "none", None, replace(_SEQUENCE, epochs=60), augment=True),
         Arm("simulation only sequence", "calibrated", _DRAWN_PRETRAINING, None, sampling=sees),
         Arm("EPNP sequence", "calibrated", _DRAWN_PRETRAINING, _DRAWN_FINETUNING, sampling=sees),
+        Arm("simulation only unrolled", "calibrated", in_steps, None, sampling=sees),
+        Arm("EPNP unrolled", "calibrated", in_steps, _DRAWN_FINETUNING, sampling=sees),
     )
-    return Study("sequence", setup, arms, writers=2, average=True, retrieval=True)
+    asked_for = "simulation only unrolled", "EPNP unrolled"
+    return Study("sequence", setup, arms, asked_for=asked_for, writers=2, average=True, retrieval=True)
 
 
 def on_sequences(study: Study) -> Study:

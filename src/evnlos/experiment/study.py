@@ -89,7 +89,8 @@ class Arm:
         network = load_weights(name).network
         if network.modality.needs_events and network.sampling.surface != self.sampling.surface:
             return None
-        given, own = (getattr(one, "frames", "") for one in (network.settings, self.pretraining.network))
+        both = network.settings, self.pretraining.network
+        given, own = ((one.kind, getattr(one, "frames", "")) for one in both)
         return name if given == own else None
 
     def first_training(self, modality: str) -> Training:
@@ -164,6 +165,8 @@ class Study:
     correct_pattern: bool = True
     """Take the frame camera's fixed pattern, as the calibration found it, from all frames; else the calibrated
     simulation has it, another one for each object."""
+    asked_for: tuple[str, ...] = ()
+    """Names of arms that are left out unless they are asked for (`--arms`)."""
 
     def __post_init__(self) -> None:
         if not self.arms or not self.modalities or not self.seeds:

@@ -130,6 +130,20 @@ class EventErrors:
         others = self.errors.double().numpy()[[name != capture for name in self.about.captures]]
         return statistic if len(others) < _FEWEST else with_errors(statistic, ScoreErrors.of(others, 1.0))
 
+    def told(self, *, corrected: bool) -> list[EventStatistic]:
+        """Return what events of each capture say of targets: the information, and its root as scores.
+
+        Scores R e of all e are made of the columns of the root R, since solving is linear.
+
+        Args:
+            corrected: Whether the errors are known (`corrected`), but for what all share, which is taken away.
+        """
+        found = [EventStatistic(np.zeros(len(r)), r @ r, r) for r in self.roots.double().numpy()]
+        if not corrected:
+            return found
+        errors = ScoreErrors.of(self.errors.double().numpy(), 1.0)
+        return [with_errors(one, replace(errors, mean=np.zeros_like(errors.mean))) for one in found]
+
     def gain_db(
         self, statistics: Sequence[EventStatistic], prior: PatternPrior, truths: Sequence[NDArray[np.floating]]
     ) -> float:

@@ -23,6 +23,7 @@ from evnlos.models.reconstructor import (
 )
 from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
 from evnlos.models.unet import ResidualUNet, UNetConfig, UNetReconstructor
+from evnlos.models.unrolled import UnrolledConfig, UnrolledReconstructor
 from evnlos.models.weights import (
     GENERIC,
     Weights,
@@ -57,6 +58,8 @@ __all__ = [
     "TargetLikelihood",
     "UNetConfig",
     "UNetReconstructor",
+    "UnrolledConfig",
+    "UnrolledReconstructor",
     "Weights",
     "describe_network",
     "drawn_targets",

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,11 +24,10 @@ from torch import Tensor
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Sampling, Simulation
 from evnlos.data.pool import run_in_order
-from evnlos.errors import ConfigError
-from evnlos.inverse.event_images import event_errors, event_prior, with_errors
+from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.event_images import event_errors, event_prior
 from evnlos.inverse.prior import ScoreErrors, root_of
 from evnlos.inverse.sequence_light import EVENT_PRIORS
-from evnlos.inverse.sequence_statistic import EventStatistic
 from evnlos.machine import Progress, counted, silent
 from evnlos.models.confidence import on_canvas
 from evnlos.scene import TRAIN_WRITERS, Glyphs, HandwritingGlyphs
@@ -93,6 +92,40 @@ class TargetGrid:
         grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
         return grid, (grid.abs() <= 1).all(dim=-1)
 
+    def means(
+        self,
+        inputs: Tensor,
+        position_m: Tensor,
+        kept: Tensor,
+        images_of: Callable[[Tensor], Tensor] | None,
+    ) -> Tensor | None:
+        """Return what subsets of the time steps show, [K, S, P, P]; a pixel is the mean where it is seen.
+
+        Args:
+            inputs: What was recorded, [N, C, H, W].
+            position_m: The plane's centre on the canvas at each, (x, y) in metres, [N, 2].
+            kept: 1 where a subset has a time step, else 0, [K, N].
+            images_of: Maps some of the inputs to S images of the canvas each; None: nothing is shown.
+
+        Raises:
+            DataError: The plane is off the canvas at all time steps of a subset.
+        """
+        total = seen = torch.zeros((), device=inputs.device)
+        for start in range(0, len(inputs), 64):
+            part = slice(start, start + 64)
+            weights = kept[:, part].to(inputs.device)
+            if images_of is not None:
+                light, inside = self.seen(images_of(inputs[part]), position_m[part])
+                total = total + torch.tensordot(weights.to(light), light, dims=1)
+            else:
+                inside = self.inside(inputs, position_m[part])
+            seen = seen + torch.tensordot(weights, inside.float(), dims=1)
+        if not bool((seen > 0).flatten(1).any(dim=1).all()):
+            raise DataError(
+                "the target plane is off the canvas at every time step; give positions within the travel"
+            )
+        return None if images_of is None else total / seen[:, None].clamp_min(1)
+
     def mean(self, images: Tensor, position_m: Tensor) -> Tensor:
         """Return the plane [P, P] that images [N, H, W] of all positions show: their mean."""
         light, inside = self.seen(images[:, None].float(), position_m)
@@ -116,7 +149,7 @@ class TargetGrid:
     def target_of(self, planes: Tensor, size_m: float, cells: int) -> Tensor:
         """Return the targets of a side in metres on so many cells, [B, h, h], that planes [B, P, P] show."""
         share = size_m / self._side_m
-        affine = torch.tensor([[share, 0.0, 0.0], [0.0, share, 0.0]]).expand(len(planes), -1, -1)
+        affine = torch.tensor([[share, 0.0, 0.0], [0.0, share, 0.0]]).expand(len(planes), -1, -1).to(planes)
         grid = F.affine_grid(affine, [len(planes), 1, 2 * cells, 2 * cells], align_corners=False)
         return F.avg_pool2d(F.grid_sample(planes[:, None], grid, align_corners=False), 2)[:, 0]
 
@@ -128,6 +161,7 @@ _POPULATIONS = 4  # of writers: what is bent anew is not as good as new, and mor
 _SIDE, _AT_ONCE, _COUNT = 64, 32, 8  # pixels of one; drawn at a time; subsets of the time steps
 _TURN, _WIDTH, _HEIGHT, _SLANT, _PLACE, _BEND = 0.08, 0.07, 0.05, 0.12, 0.016, 0.03
 _ALIKE = 4  # captures nearest in light
+_MOST_KNOWN = 64  # sequences that tell errors
 _WAVES = 5  # knots along a side of the field that bends
 
 
@@ -175,7 +209,7 @@ def drawn_targets(setup: str | Path, workers: int = 1, progress: Progress = sile
     Raises:
         ConfigError: The folder says nothing of what to learn from.
     """
-    folder = _folder(setup)
+    folder = folder_of(setup)
     if not (folder / TRAINING_FILE).is_file():
         raise ConfigError(
             f"{setup or 'no setup'} has no {TRAINING_FILE}, which says what targets to draw; make the samples "
@@ -204,7 +238,7 @@ def drawn_targets(setup: str | Path, workers: int = 1, progress: Progress = sile
     return found
 
 
-def _folder(setup: str | Path) -> Path:
+def folder_of(setup: str | Path) -> Path:
     """Return the folder of a setup that is named by it or by its file."""
     path = Path(setup)
     return path.parent if path.is_file() else path
@@ -257,6 +291,31 @@ class KnownSequence:
     solver: PooledFrames
 
 
+def known_sequences(
+    frames: Tensor,
+    truth: Tensor,
+    position_m: Tensor,
+    names: NDArray[np.str_],
+    solver: PooledFrames,
+    own: Mapping[str, PooledFrames],
+) -> list[KnownSequence]:
+    """Return sequences of known targets, at most 64.
+
+    Args:
+        frames: Of all of them, white levels, [N, H, W].
+        truth: True images on the canvas, [N, H, W].
+        position_m: The target's centre at each, [N, 2].
+        names: Sequence of each, [N].
+        solver: Solves their frames,
+        own: but for those that it has learned from: by their names.
+    """
+    found, every = list[KnownSequence](), list(dict.fromkeys(names.tolist()))
+    for name in every[:: -(-len(every) // _MOST_KNOWN)]:
+        mine = torch.from_numpy(np.flatnonzero(names == name))
+        found.append(KnownSequence(frames[mine], truth[mine], position_m[mine], own.get(name, solver).cpu()))
+    return found
+
+
 def subsets(steps: int, count: int, draw: np.random.Generator) -> Tensor:
     """Return subsets of the time steps, [K, N]: all, every other, then at least a quarter at random.
 
@@ -306,14 +365,13 @@ class DrawnFrames:
         self._roots = torch.from_numpy(roots)
 
     def __call__(self, planes: Tensor, generator: torch.Generator) -> Tensor:
-        """Return the solved images of planes [B, P, P], [B, S, P, P]: of all time steps, or of some."""
+        """Return the maps of planes [B, P, P], [B, S, P, P]: of all time steps, or of some."""
         some = torch.rand((), generator=generator) < 0.5
         k = int(torch.randint(len(self.kept), (), generator=generator)) if some else 0
         cells = F.avg_pool2d(planes[:, None], FINER).flatten(1)
         missed = self._errors[k].draw(len(cells), generator) @ self._roots[k]
         score = (cells @ self._seen[k].T).double() + self._base[k] + missed
-        found = self._solver.solved(self._information[k], score)
-        return self._grid.of_target(found, self._solver.target_plane.extent_m[0])
+        return self._solver.maps(self._information[k], score, self._grid)
 
 
 class DrawnEvents:
@@ -334,16 +392,15 @@ class DrawnEvents:
     def __init__(
         self, sampling: Sampling, grid: TargetGrid, scale: Callable[[Tensor], Tensor], position_m: Tensor
     ) -> None:
-        known = event_errors(_folder(sampling.setup), "leave --drawn at 0")
+        known = event_errors(folder_of(sampling.setup), "leave --drawn at 0")
         self._prior = event_prior(load_setup(sampling.setup), target_side_m(sampling.canvas))
         self._grid, self._scale = grid, scale
         self._errors = ScoreErrors.of(known.errors.double().numpy(), 1.0)
         self._roots, self._log_light = known.roots.double(), known.light.log()
-        # Solving is linear: the columns of a root are the scores b that R^-1 b is made of.
-        told = [EventStatistic(np.zeros(len(root)), root @ root, root) for root in self._roots.numpy()]
-        if sampling.surface == "corrected":  # which has lost what all share
+        corrected = sampling.surface == "corrected"  # which has lost what all share
+        if corrected:
             self._errors = replace(self._errors, mean=np.zeros_like(self._errors.mean))
-            told = [with_errors(one, self._errors) for one in told]
+        told = known.told(corrected=corrected)
         self._back = torch.from_numpy(np.stack([one.solutions(EVENT_PRIORS) for one in told]))  # [C, n, k, k]
         spot = torch.zeros(grid.side, grid.side)
         spot[grid.side // 2, grid.side // 2] = 1

@@ -78,6 +78,12 @@ class InputNormalization(nn.Module):
         whole[:, own] = maps
         return self(whole)[:, own]
 
+    def in_units(self, maps: Tensor) -> Tensor:
+        """Undo `of_surface` where the scale is the dataset's: surfaces in their own units, [B, C', H, W]."""
+        groups = self.modality.groups
+        (own,) = (self.modality.slices[group.name] for group in groups if group.maps == ("surface",))
+        return maps * self.size[own, None, None] + self.mean[own, None, None]
+
     def _measured(self, x: Tensor, dims: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """Return mean and size over `dims`, [B or 1, C, 1, 1] each, of every group of channels."""
         means, sizes = [], []

@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -29,9 +29,9 @@ from evnlos.models.drawn import (
     DrawnEvents,
     DrawnFrames,
     DrawnSequences,
-    KnownSequence,
     TargetGrid,
     drawn_targets,
+    known_sequences,
     subsets,
 )
 from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input
@@ -59,13 +59,9 @@ class SequenceConfig(UNetConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.prior_weights or not all(0 < weight < math.inf for weight in self.prior_weights):
-            raise ConfigError(
-                f"SequenceConfig.prior_weights is {self.prior_weights}; give at least one, all above 0"
-            )
+            raise ConfigError(f"SequenceConfig.prior_weights is {self.prior_weights}; give some, all above 0")
         if not self.rank:
-            raise ConfigError(
-                "SequenceConfig.rank is 0; a sequence network pools its linear embedding: give a rank"
-            )
+            raise ConfigError("SequenceConfig.rank is 0; a sequence network pools its embedding: give a rank")
 
     def build(self, modality: str | Modality, sampling: Sampling) -> Reconstructor:
         """Return a reconstructor of whole sequences with random weights."""
@@ -76,7 +72,7 @@ _COEFFICIENTS, _CELLS_ACROSS = 150, 32  # of prior, target
 _FEWEST = 8  # objects to tell gain, offset and noise from
 _FEWEST_CAPTURES, _MOST_FRAMES, _PARTS = 4, 2048, 4  # that correct the light path; parts left out in turn
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
-_RIDGE, _AT_ONCE, _MOST_KNOWN = 1e-6, 1024, 64  # at once: frames; known: sequences that tell errors
+_RIDGE, _AT_ONCE = 1e-6, 1024  # at once: frames
 _KEPT_ROWS = 3  # of as many motions: a sequence, its first half and its second
 
 
@@ -260,8 +256,12 @@ class PooledFrames(nn.Module):
             position_m: The target's centre at each, (x, y) in metres, [N, 2].
             kept: 1 where a subset has a time step, else 0, [K, N].
         """
+        return self.solved(*self.told(frames, position_m, kept))
+
+    def told(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what frames say, as `statistic` does; arguments of `forward`."""
         away = (frames.float() - self.ambient).flatten(1) @ self.basis - self._rows(position_m)[1]
-        return self.solved(*self.statistic(away, position_m, kept))
+        return self.statistic(away, position_m, kept)
 
     def statistic(self, away: Tensor, position_m: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
         """Return information [K, k, k] and score [K, k] of subsets of the time steps, float64.
@@ -292,6 +292,10 @@ class PooledFrames(nn.Module):
             z = torch.cholesky_solve(score[..., None], root)[..., 0].float()
             found.append(self.mean + torch.tensordot(z, self.patterns, dims=1))
         return torch.stack(found, dim=1)
+
+    def maps(self, information: Tensor, score: Tensor, grid: TargetGrid) -> Tensor:
+        """Return what a network sees of the statistic, the solved targets on the square drawn, [K, S, P, P]."""
+        return grid.of_target(self.solved(information, score), self.target_plane.extent_m[0])
 
     def errors(self, frames: Tensor, truth: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
         """Return by how much scores miss, [K, k], where the truth on the canvas is known: [N, H, W]."""
@@ -382,6 +386,8 @@ class SequenceReconstructor(Reconstructor):
 
     sees_sequence = True
     parts = PARTS
+    solver_of_frames: ClassVar[type[PooledFrames]] = PooledFrames
+    """Solves frames, and makes of it what the network sees."""
 
     def __init__(self, modality: Modality, settings: SequenceConfig, sampling: Sampling) -> None:
         super().__init__(modality, settings, sampling)
@@ -395,16 +401,23 @@ class SequenceReconstructor(Reconstructor):
         self.embedding = LinearEmbeddings(
             modality, size, settings.rank, settings.ridge_multipliers, solved, left_out
         )
-        self.frames = (
-            None if self._frame is None else PooledFrames(sampling, settings.prior_weights, settings.rank)
-        )
+        how = sampling, settings.prior_weights, settings.rank
+        self.frames = None if self._frame is None else self.solver_of_frames(*how)
         images = self.embedding.images + (0 if self.frames is None else self.frames.images)
         self.scale = PooledScale(images)
-        self.unet = ResidualUNet(images, settings)
+        self.unet = self.image_network(images)
         self.draws_sequences = not self.embedding.groups
         self._corrects = False
         self._own: dict[str, PooledFrames] = {}  # of captures that correct the light path: by others
         self.grid = TargetGrid(sampling)
+
+    def image_network(self, images: int) -> nn.Module:
+        """Return what is trained by gradients, with random weights: from so many images to the target."""
+        return ResidualUNet(images, self.settings)
+
+    def images_of(self, pooled: Tensor) -> Tensor:
+        """Return those of pooled maps [B, S, P, P] that are images, and brought to one scale: here all."""
+        return pooled
 
     def forward(self, x: Tensor) -> Tensor:
         """Map pooled maps [B, S, P, P] to images of the target plane [B, 1, P, P], 0..1."""
@@ -459,7 +472,7 @@ class SequenceReconstructor(Reconstructor):
             names += augmentations * [name]
         found = InMemoryDataset(torch.cat(inputs), torch.stack(truth), np.array(names))
         if is_new:
-            self.scale.fit(found.inputs)
+            self.scale.fit(self.images_of(found.inputs))
         return found
 
     def drawn_sequences(
@@ -478,12 +491,8 @@ class SequenceReconstructor(Reconstructor):
         shown, parts = samples if known is None else known, list[Callable[[Tensor, torch.Generator], Tensor]]()
         places = torch.from_numpy(shown.position_m)
         if self.frames is not None:
-            solver, sequences = deepcopy(self.frames).cpu(), list[KnownSequence]()
-            every = list(dict.fromkeys(shown.names.tolist()))
-            for name in every[:: -(-len(every) // _MOST_KNOWN)]:
-                mine = torch.from_numpy(np.flatnonzero(shown.names == name))
-                seen = shown.inputs[mine][:, self._frame].cpu(), shown.truth[mine].cpu()
-                sequences.append(KnownSequence(*seen, places[mine], self._own.get(name, solver).cpu()))
+            solver, frames = deepcopy(self.frames).cpu(), shown.inputs[:, self._frame].cpu()
+            sequences = known_sequences(frames, shown.truth.cpu(), places, shown.names, solver, self._own)
             parts.append(DrawnFrames(solver, sequences, self.grid))
         if self.embedding.images:
             of_one = places[shown.names == shown.names[0]]
@@ -492,7 +501,7 @@ class SequenceReconstructor(Reconstructor):
         found = DrawnSequences(drawn_targets(self.sampling.setup), self.grid, parts)
         if is_new:
             few = [found.batch(64, derive_seed(seed, "scale", number))[0] for number in range(4)]
-            self.scale.fit(torch.cat(few).half())
+            self.scale.fit(self.images_of(torch.cat(few).half()))
         return found
 
     def check_samples(self, samples: NlosDataset, *, is_new: bool) -> None:
@@ -568,28 +577,19 @@ class SequenceReconstructor(Reconstructor):
         Raises:
             DataError: The plane is off the canvas at all time steps of a subset.
         """
-        total = seen = torch.zeros((), device=inputs.device)
         last = F.one_hot(kept.cumsum(dim=1).argmax(dim=1), len(inputs)).to(kept)
         shown = last if self.sampling.surface == "so-far" else kept
-        for start in range(0, len(inputs), 64):
-            part = slice(start, start + 64)
-            weights = shown[:, part].to(inputs.device)
-            if self.embedding.images:
-                embedded = self.embedding(self.normalization(inputs[part].float()))
-                light, inside = self.grid.seen(embedded, position_m[part])
-                total = total + torch.tensordot(weights.to(light), light, dims=1)
-            else:
-                inside = self.grid.inside(inputs, position_m[part])
-            seen = seen + torch.tensordot(weights, inside.float(), dims=1)
-        if not bool((seen > 0).flatten(1).any(dim=1).all()):
-            raise DataError(
-                "the target plane is off the canvas at every time step; give positions within the travel"
-            )
-        maps = [total / seen[:, None].clamp_min(1)] if self.embedding.images else []
+        embeds = self.embedding.images > 0
+
+        def embedded(part: Tensor) -> Tensor:
+            return self.embedding(self.normalization(part.float()))
+
+        means = self.grid.means(inputs, position_m, shown, embedded if embeds else None)
+        maps = [] if means is None else [means]
         if (solver := frames or self.frames) is not None:
             with torch.autocast(inputs.device.type, enabled=False):
-                solved = solver(inputs[:, self._frame], position_m, kept.to(inputs.device))
-            maps.insert(0, self.grid.of_target(solved, solver.target_plane.extent_m[0]))
+                told = solver.told(inputs[:, self._frame], position_m, kept.to(inputs.device))
+                maps.insert(0, solver.maps(*told, self.grid))
         return torch.cat(maps, dim=1)
 
     @classmethod

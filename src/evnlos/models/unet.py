@@ -141,7 +141,11 @@ class ResidualUNet(nn.Module):
         return self.config.shuffle * 2**self.config.depth
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [B, C, H, W] to [B, 1, H, W] in 0..1.
+        """Map [B, C, H, W] to [B, 1, H, W] in 0..1; raises as `log_odds` does."""
+        return torch.sigmoid(self.log_odds(x))
+
+    def log_odds(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to what the sigmoid is taken of, float32 [B, 1, H, W].
 
         Raises:
             DataError: The input does not have the network's number of channels.
@@ -161,7 +165,7 @@ class ResidualUNet(nn.Module):
             x = F.interpolate(up(x), scale_factor=2, mode="nearest")
             x = decode(torch.cat([x, skip], dim=1))
         x = F.pixel_shuffle(self.head(x), self.config.shuffle)  # [B, 1, H, W]
-        return torch.sigmoid(x[..., :height, :width].float())
+        return x[..., :height, :width].float()
 
 
 class PooledScale(nn.Module):
