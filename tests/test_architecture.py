@@ -124,6 +124,7 @@ def test_the_core_imports_nothing_heavy(path: Path) -> None:
 WHOLE_CHAPTERS = {
     "analysis/confidence.py",
     "app/views.py",
+    "calibration/fit.py",
     "calibration/scan/film.py",
     "cameras/frame_camera.py",
     "cameras/pixels/brownian.py",

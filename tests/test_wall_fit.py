@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from evnlos.calibration import Calibration, CaptureSet, fit_setup, steps_table
+from evnlos.calibration import Calibration, CaptureSet, fit_setup, steadied, steps_table
 from evnlos.calibration.captures import grouped, wall_data
 from evnlos.calibration.wall_fit import FREEDOMS, Unknowns, WallState, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity, uneven_wall
@@ -314,3 +314,39 @@ def test_a_setup_follows_its_files(fitted):
     setup = fitted.optics.setup
     assert Path(setup.file).is_file()
     assert setup.fitted().about.notes["kept"] == list(fitted.rest.kept)
+
+
+def drifting(captures: CaptureSet, factors: list[float]) -> CaptureSet:
+    """Captures whose ambient light, 0.05 of white in those of this file, is so many times as much."""
+    own = [
+        replace(one, frames=(one.frames.astype(int) + round(255 * 0.05 * (factor - 1))).astype(np.uint8))
+        for one, factor in zip(captures.captures, factors, strict=True)
+    ]
+    return replace(captures, captures=tuple(own))
+
+
+def test_ambient_light_that_changes_from_capture_to_capture_is_told_and_taken_off(rendered, fitted) -> None:
+    """By whole digital numbers, 12.75 of which are the ambient light."""
+    factors = (
+        [1 + step / 12.75 for step in (-3, -2, -1, 0, 0, 0, 1, 2, 4)],
+        [1 - 4 / 12.75, 1, 1, 1 + 3 / 12.75],
+    )
+    plain, setup = rendered[:2], fitted.optics.setup
+    assert steadied(*plain, setup) is None
+    moved = [drifting(one, own) for one, own in zip(plain, factors, strict=True)]
+    found = steadied(moved[0], moved[1], setup)
+    assert found is not None
+    for one, own, before in zip(found, factors, plain, strict=True):
+        assert one.ambient == pytest.approx(own, abs=0.03)
+        away = one.frames().astype(float) - before.frames()
+        assert abs(away.mean()) < 0.3 and np.abs(away).max() <= 1
+        assert one.names == before.names
+
+
+def test_what_a_fit_sees_of_drifting_captures_is_what_it_sees_of_steady_ones(rendered) -> None:
+    steady = replace(rendered[1], drifts=True)
+    moved = drifting(steady, [1 - 3 / 12.75, 1, 1 + 2 / 12.75, 1 + 4 / 12.75])
+    one, other = (wall_data(captures, 48, PLANE) for captures in (steady, moved))
+    same = np.allclose(one.shared_removed(one.seen), other.shared_removed(other.seen), atol=1e-6)
+    assert same and np.ptp(other.seen.mean(axis=0) - one.seen.mean(axis=0)) > 0.02
+    assert not np.allclose(one.seen, replace(one, drifts=False).shared_removed(one.seen))

@@ -10,6 +10,7 @@ from .fit import Example as Example
 from .fit import SetupFit as SetupFit
 from .fit import Shown as Shown
 from .fit import fit_setup as fit_setup
+from .fit import steadied as steadied
 from .frame_model import FrameModel as FrameModel
 from .frame_model import FrameNoise as FrameNoise
 from .frame_model import LightLevel as LightLevel

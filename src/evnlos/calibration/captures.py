@@ -109,10 +109,14 @@ class CaptureSet:
     Args:
         captures: The captures; the motion of each is known, and, where they are `labelled`, the target.
         target_size_m: Side of the targets, metres.
+        ambient: Ambient light of each over the setup's, which its frames no longer show; () is 1.
+        drifts: Whether the ambient light of each counts as unknown.
     """
 
     captures: tuple[Capture, ...]
     target_size_m: float = 0.08
+    ambient: tuple[float, ...] = ()
+    drifts: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -194,13 +198,10 @@ def read_capture_set(
         _check_same_setup(captures[0], capture)
     side = _scene(captures[0]).target.size_m if target_size_m is None else target_size_m
     held = {name for name in chosen if _named(name, holdout)} or _drawn(chosen, share, seed)
-    if len(chosen) - len(held) < FEWEST - 1:
-        least = f"leave {FEWEST - 1} or more to fit"
-        raise DataError(f"{len(held)} of {len(chosen)} captures are held out; {least}")
-    return (
-        CaptureSet(tuple(capture for capture in captures if capture.name not in held), side),
-        CaptureSet(tuple(capture for capture in captures if capture.name in held), side),
-    )
+    if len(chosen) - len(held) < (least := FEWEST - 1):
+        raise DataError(f"{len(held)} of {len(chosen)} captures are held out; leave {least} or more to fit")
+    parts = (tuple(one for one in captures if (one.name in held) is wanted) for wanted in (False, True))
+    return CaptureSet(next(parts), side), CaptureSet(next(parts), side)
 
 
 def _named(name: str, wanted: Sequence[str]) -> bool:
@@ -281,6 +282,7 @@ class WallData:
         places: Place (x, y) of the target in each frame [N, 2], metres.
         plane: Cells of the targets' images.
         images: The targets' images [N].
+        drifts: Whether light that is the same all over the frames of a capture is left out.
     """
 
     shape: tuple[int, int]
@@ -295,10 +297,13 @@ class WallData:
     places: Array
     plane: Plane
     images: SparseImages
+    drifts: bool = False
 
     def shared_removed(self, values: NDArray) -> NDArray:
-        """Return values [P, N, ...] without what the frames of a group share."""
+        """Return values [P, N, ...] without what frames of a group share, and what a capture has all over."""
         out = np.array(values)
+        for k in np.unique(self.capture) if self.drifts else ():
+            out[:, self.capture == k] -= out[:, self.capture == k].mean(axis=(0, 1))
         for g in range(int(self.group.max()) + 1):
             rows = np.flatnonzero(self.group == g)
             out[:, rows] -= out[:, rows].mean(axis=1, keepdims=True)
@@ -375,6 +380,7 @@ def wall_data(
         np.concatenate(places),
         plane,
         SparseImages.of(drawn),
+        capture_set.drifts,
     )
 
 

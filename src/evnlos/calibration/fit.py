@@ -29,7 +29,7 @@ from evnlos.data.simulate import Simulation, ranges_around
 from evnlos.data.simulations import fitting
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import written_alike
-from evnlos.machine import Progress, Step, silent
+from evnlos.machine import Progress, Step, note, silent
 from evnlos.scene import HandwritingGlyphs, Ink, LineMotion, Strokes, Target
 from evnlos.setups import SensorSize, Setup
 
@@ -39,6 +39,10 @@ _FEWEST_FOR_ANY = 5  # captures: fewer do not tell a wall's slopes from a camera
 _WITHOUT_PATTERN = "frames held out, without pattern"
 _MOST_OF_NOISE = 1.1
 _MOST_UNEXPLAINED = {"known": 0.05, "unknown": 0.2}  # targets that nobody knows are never expected exactly
+
+_COARSER, _EVERY = 4, 2  # pixels and frames of one that the ambient light of captures is told from
+_LEAST_CHANGE, _LEAST_CHANGE_DN = 0.02, 0.1  # of ambient light from capture to capture: of itself; DN of 8 bits
+_STEADIER = 0.9  # of what is left that another fit has to reach
 
 Surfaces = dict[str, tuple[NDArray, NDArray]]
 """Time surfaces [N, 2, h, w] of camera and model by capture."""
@@ -108,6 +112,7 @@ class SetupFit:
         ink: Where the known targets have their ink.
         shown: What one frame shows of a target, whatever the method; None where that is not known.
         curved: What `curvature` says of the frames held out; zeros where it can only be the wall's.
+        ambient: Ambient light of each capture over the setup's; () where it is the same in all.
     """
 
     simulation: Simulation
@@ -126,6 +131,7 @@ class SetupFit:
     ink: Ink = field(default_factory=Ink)
     shown: Shown | None = None
     curved: tuple[float, float] = (0.0, 0.0)
+    ambient: tuple[float, ...] = ()
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -214,6 +220,14 @@ def fit_setup(
     if is_any:
         free, measured = settings.fit_distance, settings.measured
         optics = fit_wall(fit, held, start, fit_distance=free, measured=measured).optics
+        if steadied(fit, held, optics.setup):
+            note("ambient light that differs from capture to capture")
+            unsteady = replace(fit, drifts=True), replace(held, drifts=True)
+            there = fit_wall(*unsteady, start, fit_distance=free, measured=measured).optics.setup
+            steady = steadied(fit, held, there) or (fit, held)
+            again = fit_wall(*steady, start, fit_distance=free, measured=measured).optics
+            if _left_of(steady[1], again.setup) < _STEADIER * _left_of(held, optics.setup):
+                optics, (fit, held) = again, steady
     elif settings.targets == "known":
         optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     else:
@@ -264,7 +278,7 @@ def fit_setup(
         seen_targets = [*zip(fit.names, fit.scenes, strict=True), *zip(held.names, held.scenes, strict=True)]
         side = simulation.glyphs.target_plane.size_m
         known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
-    training = training_simulation(simulation, noise, pixel, shown)
+    training = training_simulation(simulation, noise, pixel, shown, (*fit.ambient, *held.ambient))
     return SetupFit(
         simulation,
         training,
@@ -282,7 +296,46 @@ def fit_setup(
         Ink.of(shown),
         Shown.by(simulation),
         curved if curved[0] < 0 or about.tone or about.log else (0.0, 0.0),  # else it is the wall's
+        (*fit.ambient, *held.ambient),
     )
+
+
+def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSet, CaptureSet] | None:
+    """Return captures without what the ambient light of each has more or less than the setup's.
+
+    Daylight, and lamps elsewhere in the room, change from one recording to the next; what is fitted takes it to
+    be the same in all.
+
+    Args:
+        fit: Captures that were fitted.
+        held: Captures that were held out.
+        setup: What was fitted to them.
+
+    Returns:
+        The same captures; None where they do not differ by what frames show.
+    """
+    low = (max(8, round(fit.shape[0] / _COARSER)), max(8, round(fit.shape[1] / _COARSER)))
+    factors = [FrameModel(one, low, _EVERY).ambient_factors(setup) for one in (fit, held)]
+    every, around = np.concatenate(factors), setup.ambient_light(fit.shape).numpy()
+    if not every.std() > _LEAST_CHANGE or not every.std() * around.mean() * 255 > _LEAST_CHANGE_DN:
+        return None
+    middle = float(np.median(every))
+    found = list[CaptureSet]()
+    for one, own in zip((fit, held), factors, strict=True):
+        parts = np.array(own) / middle
+        captures = []
+        for capture, part in zip(one.captures, parts.tolist(), strict=True):
+            less = np.rint(capture.frames - np.float32((part - 1) * middle * one.peak) * around)
+            frames = less.clip(0, one.peak).astype(capture.frames.dtype)
+            captures.append(replace(capture, frames=np.where(capture.frames >= one.peak, one.peak, frames)))
+        found.append(replace(one, captures=tuple(captures), ambient=tuple(parts.tolist())))
+    return found[0], found[1]
+
+
+def _left_of(held: CaptureSet, setup: Setup) -> float:
+    """Return what a setup leaves of frames, over their standard deviation."""
+    model = FrameModel(held, held.shape, _EVERY)
+    return model.relative((model.frames - model.predict(setup)) * model.weight)
 
 
 def _is_any(settings: Calibration, fit: CaptureSet) -> bool:
@@ -367,7 +420,11 @@ _LEAK_HZ = 0.1  # captures of some seconds do not show a smaller leak
 
 
 def training_simulation(
-    fitted: Simulation, noise: FrameNoise, pixel: PixelFit | None, shown: Sequence[Target]
+    fitted: Simulation,
+    noise: FrameNoise,
+    pixel: PixelFit | None,
+    shown: Sequence[Target],
+    ambient: Sequence[float] = (),
 ) -> Simulation:
     """Return the simulation to pre-train on: the fitted one, varied from object to object.
 
@@ -379,11 +436,15 @@ def training_simulation(
         noise: The frame camera's noise.
         pixel: The fitted event pixel; None where only frames were fitted.
         shown: The known targets; none where they are unknown.
+        ambient: Ambient light of the captures over the fitted one.
     """
     glyphs = fitted.glyphs
     if isinstance(glyphs, HandwritingGlyphs):
         glyphs = written_alike(replace(glyphs, strokes=Strokes("both")), shown)
     vary = fitted.vary | ranges_around(fitted, _SPREAD)
+    if ambient:
+        low, high = vary["setup.ambient"]
+        vary["setup.ambient"] = (low * min(1.0, *ambient), high * max(1.0, *ambient))
     for one in fitted.setup.parameters():
         if one.role == "place":
             vary[f"setup.{one.name}"] = (one.value - _SLACK_M, one.value + _SLACK_M)
