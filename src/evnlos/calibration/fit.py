@@ -317,12 +317,12 @@ def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSe
     low = (max(8, round(fit.shape[0] / _COARSER)), max(8, round(fit.shape[1] / _COARSER)))
     factors = [FrameModel(one, low, _EVERY).ambient_factors(setup) for one in (fit, held)]
     every, around = np.concatenate(factors), setup.ambient_light(fit.shape).numpy()
-    if not every.std() > _LEAST_CHANGE or not every.std() * around.mean() * 255 > _LEAST_CHANGE_DN:
+    spread, middle = float(every.std()), float(np.median(every))
+    if not (spread > _LEAST_CHANGE and spread * around.mean() * 255 > _LEAST_CHANGE_DN and middle > 0):
         return None
-    middle = float(np.median(every))
     found = list[CaptureSet]()
     for one, own in zip((fit, held), factors, strict=True):
-        parts = np.array(own) / middle
+        parts = (np.array(own) / middle).clip(0)
         captures = []
         for capture, part in zip(one.captures, parts.tolist(), strict=True):
             less = np.rint(capture.frames - np.float32((part - 1) * middle * one.peak) * around)
