@@ -200,8 +200,8 @@ def read_capture_set(
     held = {name for name in chosen if _named(name, holdout)} or _drawn(chosen, share, seed)
     if len(chosen) - len(held) < (least := FEWEST - 1):
         raise DataError(f"{len(held)} of {len(chosen)} captures are held out; leave {least} or more to fit")
-    parts = (tuple(one for one in captures if (one.name in held) is wanted) for wanted in (False, True))
-    return CaptureSet(next(parts), side), CaptureSet(next(parts), side)
+    fitted = tuple(capture for capture in captures if capture.name not in held)
+    return CaptureSet(fitted, side), CaptureSet(tuple(one for one in captures if one.name in held), side)
 
 
 def _named(name: str, wanted: Sequence[str]) -> bool:

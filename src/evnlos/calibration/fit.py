@@ -134,6 +134,12 @@ class SetupFit:
     ambient: tuple[float, ...] = ()
 
     @property
+    def ambient_words(self) -> str:
+        """How the ambient light differs from capture to capture; empty where it does not."""
+        own = self.ambient
+        return f"{min(own):.2f} to {max(own):.2f} times it from capture to capture" if own else ""
+
+    @property
     def captures(self) -> tuple[str, ...]:
         """Names of all captures that the calibration saw."""
         return (*self.fitted, *self.held_out)
@@ -218,16 +224,7 @@ def fit_setup(
         )
     begin(1)
     if is_any:
-        free, measured = settings.fit_distance, settings.measured
-        optics = fit_wall(fit, held, start, fit_distance=free, measured=measured).optics
-        if steadied(fit, held, optics.setup):
-            note("ambient light that differs from capture to capture")
-            unsteady = replace(fit, drifts=True), replace(held, drifts=True)
-            there = fit_wall(*unsteady, start, fit_distance=free, measured=measured).optics.setup
-            steady = steadied(fit, held, there) or (fit, held)
-            again = fit_wall(*steady, start, fit_distance=free, measured=measured).optics
-            if _left_of(steady[1], again.setup) < _STEADIER * _left_of(held, optics.setup):
-                optics, (fit, held) = again, steady
+        optics, fit, held = _fit_any(settings, fit, held, start)
     elif settings.targets == "known":
         optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     else:
@@ -239,13 +236,12 @@ def fit_setup(
     predicted = {name: model.predict(optics.setup) for name, model in models.items()}
     noise = fit_frame_noise(fit, predicted["fit"].numpy(), settings.start.frame_camera)
     for name, model in models.items():
-        before = model.relative((model.frames - model.predict(optics.before)) * model.weight)
-        after = model.relative((model.frames - predicted[name]) * model.weight)
+        before, after = model.left(model.predict(optics.before)), model.left(predicted[name])
         spread = float(model.frames.std(correction=0))
         residuals[f"frames {name}"] = Residual(before, after, noise.temporal / spread)
     lit = torch.from_numpy(noise.pattern.correct(held.frames(), held.peak))
     seen = models["held out"]
-    corrected = seen.relative((lit - predicted["held out"]) * seen.weight)
+    corrected = seen.left(predicted["held out"], lit)
     residuals[_WITHOUT_PATTERN] = replace(
         residuals["frames held out"], before=residuals["frames held out"].after, after=corrected
     )
@@ -290,7 +286,7 @@ def fit_setup(
         residuals,
         examples,
         settings.targets,
-        float(seen.relative((seen.frames - models["fit"].frames.mean(dim=0)) * seen.weight)),
+        seen.left(models["fit"].frames.mean(dim=0)),
         known,
         frame_doubt(held, optics.setup, noise) if is_any else 1.0,
         Ink.of(shown),
@@ -314,16 +310,12 @@ def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSe
     Returns:
         The same captures; None where they do not differ by what frames show.
     """
-    low = (max(8, round(fit.shape[0] / _COARSER)), max(8, round(fit.shape[1] / _COARSER)))
-    factors = [FrameModel(one, low, _EVERY).ambient_factors(setup) for one in (fit, held)]
-    every, around = np.concatenate(factors), setup.ambient_light(fit.shape).numpy()
-    spread, middle = float(every.std()), float(np.median(every))
-    if not (spread > _LEAST_CHANGE and spread * around.mean() * 255 > _LEAST_CHANGE_DN and middle > 0):
+    factors, around = _ambient_changes(fit, held, setup), setup.ambient_light(fit.shape).numpy()
+    if factors is None:
         return None
-    found = list[CaptureSet]()
+    middle, found = float(np.median(np.concatenate(factors))), list[CaptureSet]()
     for one, own in zip((fit, held), factors, strict=True):
-        parts = (np.array(own) / middle).clip(0)
-        captures = []
+        parts, captures = (np.array(own) / middle).clip(0), []
         for capture, part in zip(one.captures, parts.tolist(), strict=True):
             less = np.rint(capture.frames - np.float32((part - 1) * middle * one.peak) * around)
             frames = less.clip(0, one.peak).astype(capture.frames.dtype)
@@ -332,10 +324,38 @@ def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSe
     return found[0], found[1]
 
 
-def _left_of(held: CaptureSet, setup: Setup) -> float:
-    """Return what a setup leaves of frames, over their standard deviation."""
-    model = FrameModel(held, held.shape, _EVERY)
-    return model.relative((model.frames - model.predict(setup)) * model.weight)
+def _ambient_changes(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[tuple[float, ...]] | None:
+    """Return the ambient light of each capture over the setup's; None where frames do not show a change."""
+    low = (max(8, round(fit.shape[0] / _COARSER)), max(8, round(fit.shape[1] / _COARSER)))
+    factors = [FrameModel(one, low, _EVERY).ambient_factors(setup) for one in (fit, held)]
+    every, level = np.concatenate(factors), float(setup.ambient_light(fit.shape).mean())
+    spread, middle = float(every.std()), float(np.median(every))
+    is_seen = spread > _LEAST_CHANGE and spread * level * 255 > _LEAST_CHANGE_DN and middle > 0
+    return factors if is_seen else None
+
+
+def _fit_any(
+    settings: Calibration, fit: CaptureSet, held: CaptureSet, start: Setup
+) -> tuple[TransportFit, CaptureSet, CaptureSet]:
+    """Return the fit of a wall of any kind, and the captures behind it, `steadied` where that helps."""
+
+    def wall(one: CaptureSet, other: CaptureSet) -> TransportFit:
+        how = {"fit_distance": settings.fit_distance, "measured": settings.measured}
+        return fit_wall(one, other, start, **how).optics
+
+    def left(other: CaptureSet, setup: Setup) -> float:
+        model = FrameModel(other, other.shape, _EVERY)
+        return model.left(model.predict(setup))
+
+    optics = wall(fit, held)
+    if _ambient_changes(fit, held, optics.setup) is None:
+        return optics, fit, held
+    note("ambient light that differs from capture to capture")
+    there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
+    steady = steadied(fit, held, there) or (fit, held)
+    again = wall(*steady)
+    is_better = left(steady[1], again.setup) < _STEADIER * left(held, optics.setup)
+    return (again, *steady) if is_better else (optics, fit, held)
 
 
 def _is_any(settings: Calibration, fit: CaptureSet) -> bool:

@@ -147,6 +147,10 @@ class FrameModel:
         """Return the root mean square of a residual over the frames' standard deviation, over all pixels."""
         return relative_residual(residual, self.frames, self.weight)
 
+    def left(self, predicted: torch.Tensor, seen: torch.Tensor | None = None) -> float:
+        """Return what a prediction leaves, as `relative` does: of the frames, or of others in their place."""
+        return self.relative(((self.frames if seen is None else seen) - predicted) * self.weight)
+
     def _strips(self, plane: Plane) -> torch.Tensor:
         """Return every frame's target on the strip of cells, float32 [N, cells]; drawn once for each strip."""
         if plane not in self._drawn:

@@ -55,18 +55,18 @@ def rows_of(fit: SetupFit, start_pixel: Any, start_camera: Any) -> list[Row]:
         start_pixel: Event pixel of the start.
         start_camera: Frame camera of the start.
     """
-    first, last = (optics := fit.optics).before, optics.setup
+    optics = fit.optics
+    first, last = optics.before, optics.setup
     start, end = values_of(first), values_of(last)
     bound = {name: f"on the bound of the search: {value:.4g}" for name, value in optics.on_bound.items()}
     rows = [
         Row(f"setup.{p.name}", start[p.name], end[p.name], float(e), p.unit, bound.get(p.name, ""))
         for p, e in zip(optics.parameters, optics.error, strict=True)
     ]
-    gain, own = _UNTOLD if fit.targets == "unknown" else "", fit.ambient
-    changes = f"{min(own):.2f} to {max(own):.2f} times it from capture to capture" if own else ""
+    gain = _UNTOLD if fit.targets == "unknown" else ""
     rows += [
         Row("setup.gain", first.gain, last.gain, None, "white levels", gain),
-        Row("setup.ambient", first.ambient, last.ambient, None, "white levels", changes),
+        Row("setup.ambient", first.ambient, last.ambient, None, "white levels", fit.ambient_words),
     ]
     rows += [
         Row(f"setup.ambient_gradient.{k}", first.ambient_gradient[k], last.ambient_gradient[k], None, "")

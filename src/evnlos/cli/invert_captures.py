@@ -26,7 +26,7 @@ from evnlos.data import Capture, pattern_of, read_capture
 from evnlos.data.fixed_pattern import object_light
 from evnlos.data.sampling import read_target
 from evnlos.errors import ConfigError
-from evnlos.inverse import SequenceLights, SequenceOperator, SequenceProblem, unexplained
+from evnlos.inverse import TRACKED_ROOM, SequenceLights, SequenceOperator, SequenceProblem, unexplained
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
@@ -79,8 +79,8 @@ def invert_captures(
     groups = _by_motion(captures, options, setup, progress)
     for done, (motion, members) in enumerate(counted(groups, progress, "invert", len(groups), "motions")):
         size = captures[members[0]].info.target_size_m
-        if _is_tracked(captures[members[0]], options):
-            size *= 1.25  # a tracked position is that of the light's middle, which need not be the target's
+        if _is_tracked(captures[members[0]], options.track):
+            size *= TRACKED_ROOM
         target_plane = Plane(options.cells, options.cells, size / options.cells)
         progress(Step("invert", done, len(groups), "motions", within="light path of the setup"))
         transport = matrix_of(setup.seen_by((height, width)).operator(strip_of(motion, target_plane), shape))
@@ -183,7 +183,7 @@ def _by_motion(
     """Return each motion [N, 2], metres, of frames 1..N with the captures that share it."""
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
     for k, capture in enumerate(captures):
-        if _is_tracked(capture, options):
+        if _is_tracked(capture, options.track):
             if options.colour is not None:  # each colour would be centred on its own light
                 cure = "state it in capture.yaml (`evnlos track` finds it), and leave --track"
                 raise ConfigError(f"{capture.name}: --colours needs a motion that is known; {cure}")
@@ -207,8 +207,8 @@ def _followed(capture: Capture, setup: Setup, *, by_frames: bool = True) -> Capt
     return replace(capture, path=found.motion)
 
 
-def _is_tracked(capture: Capture, options: SequenceOptions) -> bool:
-    return options.track or capture.motion is None
+def _is_tracked(capture: Capture, track: bool) -> bool:
+    return track or capture.motion is None
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def estimate_captures(
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
         seen = _read_colours(folder, evidence) if colours else {None: capture_of(folder, evidence)}
         one = seen.get(None)
-        if one is not None and (track or one.motion is None):
+        if one is not None and _is_tracked(one, track):
             seen = {None: _followed(one, setup, by_frames=evidence != "events")}
         each = [estimate_target(one, setup, *how, colour) for colour, one in seen.items()]
         parts = [_row(*pair) for pair in zip(seen.values(), each, strict=True)]

@@ -43,6 +43,7 @@ from .operators import log_change as log_change
 from .operators import operator_norm as operator_norm
 from .operators import ridge_by_groups as ridge_by_groups
 from .operators import unexplained as unexplained
+from .prior import TRACKED_ROOM as TRACKED_ROOM
 from .prior import PatternPrior as PatternPrior
 from .prior import ScoreErrors as ScoreErrors
 from .prior import best_bent as best_bent

@@ -31,7 +31,7 @@ from evnlos.inverse.prior import PatternPrior, ScoreErrors, handwritten_prior, r
 from evnlos.inverse.sequence_light import EVENT_PRIORS, sequence_light
 from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
 from evnlos.machine import note
-from evnlos.scene import LineMotion, Motion, Target
+from evnlos.scene import Ink, LineMotion, Motion, Target
 from evnlos.setups import Setup, load_setup
 from evnlos.tensor_file import TensorFile
 from evnlos.types import Events, Plane, target_side_m
@@ -404,15 +404,19 @@ def _worth_solving(seen: _Sequence) -> list[int]:
     return steps
 
 
-def event_prior(setup: Setup, side_m: float, patterns: int = COEFFICIENTS) -> PatternPrior:
+def event_prior(
+    setup: Setup, side_m: float, patterns: int = COEFFICIENTS, letters_m: float = 0.0
+) -> PatternPrior:
     """Return the prior over targets that events are solved with: letters as large as the setup's known ones.
 
     Args:
         setup: The setup.
         side_m: Side of the target plane, metres.
         patterns: Patterns that are kept.
+        letters_m: Size of letters of a setup that knows none, metres; 0 = as large as the plane.
     """
-    return handwritten_prior(Plane(CELLS, CELLS, side_m / CELLS), patterns, ink=setup.ink)
+    ink = setup.ink if setup.ink.size_m or not letters_m else Ink(letters_m)
+    return handwritten_prior(Plane(CELLS, CELLS, side_m / CELLS), patterns, ink=ink)
 
 
 @lru_cache(maxsize=2)

@@ -28,6 +28,8 @@ from evnlos.untrusted import open_image
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+TRACKED_ROOM = 1.25
+"""Side of the plane of a target that was tracked over the target's: the light's middle need not be its own."""
 TEST_CHARACTERS = "AGKS249"
 """Characters that the prior never sees, from writers that it never sees."""
 TRAIN_CHARACTERS = "BCDEFHIJLMNOPQRTUVWXYZ0135678"

@@ -41,6 +41,7 @@ from evnlos.data import Capture, FixedPattern
 from evnlos.data.fixed_pattern import object_light, own_pixels
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.inverse import (
+    TRACKED_ROOM,
     FilmEstimate,
     FilmFrames,
     FrameTerm,
@@ -51,14 +52,12 @@ from evnlos.inverse import (
     estimate_event_film,
     estimate_film,
     estimate_sequence,
-    handwritten_prior,
     record_of,
 )
-from evnlos.inverse.event_images import CELLS, COEFFICIENTS, event_prior
+from evnlos.inverse.event_images import COEFFICIENTS, event_prior
 from evnlos.machine import Progress, note, silent
 from evnlos.models.unet import ResidualUNet, UNetConfig
 from evnlos.models.weights import weights_folders
-from evnlos.scene import Ink
 from evnlos.setups import Setup
 from evnlos.tensor_file import TensorFile
 from evnlos.types import Colour, Plane
@@ -73,7 +72,6 @@ _TOGETHER = 32  # samples that the network sees at a time
 _PATTERNS = 120  # of a target: all that a minute of a core allows where events are solved in full
 _GAP_S = 0.4  # between the instants at which silences are looked at
 _NORMAL_90 = 1.645
-_ROOM = 1.25  # of the side of a target that was tracked
 _BESIDE = 0.02  # an interval of samples is widened by it: what is dark for sure is no interval of width 0
 OPEN = 0.2
 """Width of an interval, brightness, from which a cell counts as left open."""
@@ -343,8 +341,7 @@ def estimate_target(
     motion, size = capture.path, capture.info.target_size_m
     patterns = _PATTERNS if prior is None or evidence != "frames" else COEFFICIENTS
     if motion is not None:
-        plane = Plane(CELLS, CELLS, _ROOM * size / CELLS)
-        basis = handwritten_prior(plane, patterns, ink=setup.ink if setup.ink.size_m else Ink(size))
+        basis = event_prior(setup, TRACKED_ROOM * size, patterns, size)
     elif capture.motion is not None:
         motion, basis = capture.motion.in_its_plane(), event_prior(setup, size, patterns)
     else:

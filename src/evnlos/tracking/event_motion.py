@@ -28,6 +28,7 @@ from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import event_histogram
 from evnlos.inverse import (
+    TRACKED_ROOM,
     EventRecord,
     EventSolver,
     LikelihoodSettings,
@@ -177,7 +178,6 @@ _DARK = 1e-3  # white levels, of which the logarithm is taken at least
 _UNTOLD = 0.25  # standard deviation of a place, sides of the target, from which on it is not told
 _UNSURE = 0.3  # deviation of a first guess, sides of the target
 _BLUR_PX, _RESTS = 1.5, 0.1  # of first guesses; share of the time in which a pixel shows least light
-_ROOM = 1.25  # of the target plane that surely holds an object, over the object
 
 
 def fit_motion_to_events(
@@ -322,7 +322,7 @@ class EventFit:
 
         plane = Plane(cells, cells, size_m / cells)
         # Not where the setup's own letters had their ink: the light's middle is the target's here.
-        self._ink = Ink(setup.ink.size_m or size_m / _ROOM)
+        self._ink = Ink(setup.ink.size_m or size_m / TRACKED_ROOM)
         self.prior: PatternPrior = handwritten_prior(plane, min(_PATTERNS, cells**2), ink=self._ink)
         self.kinds = [0, 1, *([2] if depth else []), *([3] if turning else [])]
         self._scale = np.array([1.0, 1.0, setup.default_distance_m or 1.0, size_m / 4])  # to metres

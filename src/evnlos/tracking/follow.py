@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evnlos.data.capture import Capture
 from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import SequenceOperator, SequenceProblem, SeveralSequences
+from evnlos.inverse import TRACKED_ROOM, SequenceOperator, SequenceProblem, SeveralSequences
 from evnlos.inverse.sequence_problem import matrix_of, strip_of
 from evnlos.setups import Setup
 from evnlos.tracking.event_motion import EventVelocity, event_velocity, fit_motion_to_events
@@ -48,7 +48,6 @@ from evnlos.tracking.track import (
 )
 from evnlos.types import Events, Plane
 
-_ROOM = 1.25  # of the target's side: the light's middle need not be the target's
 _FINER = 8  # instants of a track by events, for each that the path was found at
 _IMAGE_CELLS = 32  # a side of an image of one of several objects
 _PRIOR, _STATIC = 4.0, 1.0  # weight of its prior, as `evnlos invert` takes it; a pixel's offset over its noise
@@ -108,7 +107,7 @@ class Tracking:
     def of(self, capture: Capture | None) -> float:
         """Return the side of a square that surely holds the object, metres."""
         stated = 0.08 if capture is None else capture.info.target_size_m
-        return _ROOM * stated if self.target_size_m is None else self.target_size_m
+        return TRACKED_ROOM * stated if self.target_size_m is None else self.target_size_m
 
 
 def track_several(
