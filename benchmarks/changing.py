@@ -2,6 +2,7 @@
 
     python benchmarks/changing.py [SEED...]    # of several seeds the mean, and the standard error of the gain
     python benchmarks/changing.py events       # from events, and from few frames with events between them
+    python benchmarks/changing.py newest       # what `evnlos live --changing` shows: the newest image alone
 
 Rough aluminium at 0.3 m, 32 x 48 pixels, a plane of 10 cm, 6 s at 10 frames per second, noise of the default
 frame camera with its fixed pattern taken off, ambient light 0.05. The wall is rendered from cells of 1.6 mm
@@ -17,10 +18,14 @@ intervals; "film over rigid" is over the better one of "static" and "rigid".
 
 `events`: seed 0, a pixel with thresholds of 0.2 (spread 0.03), 0.1 noise events per second. "few frames" is the
 film of 2 frames per second, on a line between them; "few frames, events" the one estimate of both.
+
+`newest`: seed 0, frames; the image of the instant, made of the newest second, of the newest 3 s, and of all so
+far (`RunningFilm`), mean over the instants 1, 1.5, ... 5.5 s, beside the film of the whole at these instants.
 """
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -42,10 +47,11 @@ from evnlos.inverse import (
 from evnlos.inverse.sequence_problem import matrix_of, strip_of
 from evnlos.inverse.tikhonov import Spectrum
 from evnlos.metrics import psnr
+from evnlos.models import FilmSolver, RunningFilm
 from evnlos.optics import FilmWall, MatrixTransport
 from evnlos.scene import Film, closing_hand, drawing
 from evnlos.setups import RadiometricSetup
-from evnlos.types import Plane
+from evnlos.types import Events, Plane
 
 SIDE, SHAPE, SECONDS, RATE_HZ, AMBIENT = 64, (32, 48), 6.0, 10.0, 0.05
 FINE, COARSE = Plane(SIDE, SIDE, 0.1 / SIDE), Plane(SIDE // 2, SIDE // 2, 0.2 / SIDE)
@@ -198,6 +204,27 @@ def compare_events(name: str, seed: int, roughness: float) -> list[str]:
     ]
 
 
+def compare_newest(name: str, seed: int, roughness: float) -> list[float]:
+    """Return PSNR, dB, of the newest image by the newest second, 3 s, and all, and of the whole film."""
+    setup = RadiometricSetup(roughness=roughness, strip_m=(0.1, 0.1), ambient=AMBIENT).resized(SHAPE)
+    wall = FilmWall(operator_of(setup, FINE), film := FILMS[name](), ambient=setup.ambient_light())
+    times_us = np.arange(round(SECONDS * RATE_HZ)) * round(1e6 / RATE_HZ) + 20_000
+    camera = FrameCamera(exposure_s=0.016, prnu=0, dsnu_e=0)
+    frames = (camera.capture(wall, times_us * 1e-6, seed) / camera.white).astype(np.float32)
+    truth, none, looked = coarse(film.at(times_us * 1e-6)), Events.empty(*SHAPE[::-1]), range(10, 60, 5)
+    solver = FilmSolver(replace(setup, frame_camera=camera), COARSE)
+    found: list[float] = []
+    for newest_s in (1.0, 3.0, SECONDS):
+        running, seen = RunningFilm(solver, "frames", newest_s), []
+        for k, frame in enumerate(frames):
+            running.add(none, int(times_us[k]), frame)
+            if k in looked and (made := running.newest()):
+                seen.append(decibel(torch.from_numpy(made[0])[None].double(), truth[k : k + 1]))
+        found.append(float(np.mean(seen)))
+    whole = solver.film(times_us * 1e-6, frames)
+    return [*found, decibel(torch.from_numpy(whole.mean)[list(looked)], truth[list(looked)])]
+
+
 def on_plane(strips: torch.Tensor, strip: Plane) -> torch.Tensor:
     """Return strips [T, h, w] on the solver's cells; the two differ by less than a cell."""
     y, x = (
@@ -222,6 +249,13 @@ if __name__ == "__main__":
         for wall_roughness in (0.05, 0.02):
             for film_name in FILMS:
                 cells = compare_events(film_name, 0, wall_roughness)
+                print(f"| {film_name}, roughness {wall_roughness:g} | {' | '.join(cells)} |", flush=True)
+        sys.exit()
+    if sys.argv[1:] == ["newest"]:
+        print("| | newest second | newest 3 s | all so far | film of the whole |\n|" + "---|" * 5)
+        for wall_roughness in (0.05, 0.02):
+            for film_name in FILMS:
+                cells = [f"{one:.2f}" for one in compare_newest(film_name, 0, wall_roughness)]
                 print(f"| {film_name}, roughness {wall_roughness:g} | {' | '.join(cells)} |", flush=True)
         sys.exit()
     print("| | blind | static | rigid | limit | frame by frame | film | film over rigid | covered |")

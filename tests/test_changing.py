@@ -1,6 +1,7 @@
 """A film of a hidden plane that changes, against whole covariances; its intervals hold the truth."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
+from evnlos.data import read_capture
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.inverse import (
@@ -20,10 +22,13 @@ from evnlos.inverse import (
     NormalEquations,
     estimate_event_film,
     estimate_film,
+    film_plane,
     record_of,
     smooth_modes,
 )
 from evnlos.inverse.event_film import FilmLight, FilmRows, film_equations
+from evnlos.live.sources import SourceOptions, film_of, open_live
+from evnlos.models import FilmSolver, RunningFilm, estimate_film_of
 from evnlos.optics import FilmWall, MatrixTransport
 from evnlos.scene import Film, closing_hand
 from evnlos.setups import load_setup
@@ -269,7 +274,10 @@ def test_events_tell_a_film_and_frames_beside_them_more() -> None:
         estimate_event_film(operator, still, record, law, np.linspace(0, 3, 400))
 
 
-def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Film]:
+    """Return the folder of setup.yaml and of a capture, `hand`, of a hand that closes, and the film."""
+    tmp_path = tmp_path_factory.mktemp("changing")
     settings = {
         "kind": "radiometric",
         "strip_m": [0.1, 0.1],
@@ -293,7 +301,14 @@ def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.Ca
     write_events(folder / "events.npz", EventCamera(setup.pixel).record(wall, 0.0, 1.1, seed=1))
     about = {"camera": {"name": "simulated", "width": 32, "height": 20}, "events": "events.npz"}
     (folder / "capture.yaml").write_text(yaml.safe_dump(about))
-    words = ["invert", str(folder), "--setup", str(tmp_path / "setup.yaml"), "--changing", "0.1", "0.1"]
+    return tmp_path, film
+
+
+def test_the_command_makes_a_film_of_a_capture(
+    hand: tuple[Path, Film], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home, film = hand
+    words = ["invert", str(home / "hand"), "--setup", str(home / "setup.yaml"), "--changing", "0.1", "0.1"]
     main([*words, "--cells", "16", "--out", str(tmp_path / "film.png"), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["cells"] == [16, 16]
@@ -318,3 +333,57 @@ def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.Ca
         course = np.load(tmp_path / f"{source}.npz")["film"]
         changes = (course - course.mean(axis=0)).ravel()
         assert np.corrcoef(changes, rest.ravel())[0, 1] > 0.6
+
+
+def test_the_newest_image_while_it_is_seen_is_the_last_of_the_film(hand: tuple[Path, Film]) -> None:
+    home, _ = hand
+    setup, capture = load_setup(home / "setup.yaml"), read_capture(home / "hand")
+    plane, times = film_plane((0.1, 0.1), 16), capture.frame_times_us
+    for evidence, newest_s, first in (("frames", 3.0, 0), ("frames", 0.45, 7), ("events", 3.0, 0)):
+        running = RunningFilm(FilmSolver(setup, plane), evidence, newest_s)
+        assert running.newest() is None
+        for k, frame in enumerate(capture.frames):
+            events = capture.events.between(-1 if k == 0 else int(times[k - 1]), int(times[k]))
+            running.add(events, int(times[k]), frame / np.float32(capture.peak))
+        found, chosen = running.newest(), slice(first, None)
+        cut = replace(capture, frames=capture.frames[chosen], frame_times_us=times[chosen])
+        expected = estimate_film_of(cut, setup, plane, evidence)
+        assert found is not None and found[1] == times[-1]
+        np.testing.assert_allclose(found[0], expected.mean[-1], atol=0.02 if evidence == "events" else 1e-4)
+        running.forget()
+        assert running.newest() is None
+    with pytest.raises(ConfigError, match=r"newest_s is 0.1; give 0\.3 seconds"):
+        RunningFilm(FilmSolver(setup, plane), "frames", 0.1)
+
+
+def test_a_live_run_shows_what_the_plane_shows_now(
+    hand: tuple[Path, Film], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home, film = hand
+    words = ["live", str(home / "hand"), "--setup", str(home / "setup.yaml"), "--headless", "--json"]
+    changing = ["--changing", "0.1", "0.1", "--cells", "16"]
+    main([*words, *changing, "--speed", "0.5", "--out", str(tmp_path / "out")])
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["weights"] is None and shown["modality"] == "no network" and shown["images"] > 20
+    assert shown["beside"]["title"] == "plane that changes" and shown["beside"]["images"] >= 1
+    assert shown["latency_ms"]["network"]["max"] < 5 and "film" in str(shown["verdict"])
+    beside = film_of(load_setup(home / "setup.yaml"), film_plane((0.1, 0.1), 16), open_live(str(home / "hand")))
+    beside.begin()
+    for part in open_live(str(home / "hand"), SourceOptions(speed=100)).chunks(lambda: False):
+        beside.add([part])
+    beside.finish()
+    beside.close()
+    picture = beside.newest
+    assert picture.t_us == 1_100_000 and picture.image.shape == (16, 16)
+    assert np.square(picture.image - film.at(1.1)).mean() < 0.05
+    for wrong, said in (
+        (words, "give --changing WIDTH HEIGHT and --setup together"),
+        (
+            [*words, *changing[:3], "--cells", "1"],
+            "0.1 x 0.1 m of 1 cells; give sides above 0 and 2 cells or more",
+        ),
+        ([*words, *changing, "--newest", "0"], "newest_s is 0; give 0.3 seconds or more"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*wrong, "--out", str(tmp_path / "none")])
+        assert said in capsys.readouterr().err

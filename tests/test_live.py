@@ -707,8 +707,8 @@ def test_the_image_of_all_so_far_stands_beside_a_replay(tiny_captures, tmp_path:
     call = ["live", folder, *both, "--headless", "--json", "--speed", "20"]
     main([*call, "--out", str(tmp_path / "out")])
     table = recorded(tmp_path / "out", capsys)
-    assert table["so_far"]["images"] >= 1 and table["images"] > 0
-    capture, beside = read_capture(folder), so_far_of(tmp_path / "all.safetensors", folder)
+    assert table["beside"]["images"] >= 1 and table["images"] > 0
+    capture, beside = read_capture(folder), so_far_of(tmp_path / "all.safetensors", open_live(folder))
     samples = capture_samples(capture, sampling)
     beside.begin()
     for part in capture_replay(folder, speed=10, clock=Turned()).chunks(NEVER):
@@ -717,26 +717,27 @@ def test_the_image_of_all_so_far_stands_beside_a_replay(tiny_captures, tmp_path:
     beside.close()
     seen = network.modality.inputs(samples.frame, samples.surface)
     expected = network.infer(seen, samples.position_m, so_far=True)[-1].numpy()
-    np.testing.assert_allclose(beside.newest, expected, atol=1e-5)
+    np.testing.assert_allclose(beside.newest.image, expected, atol=1e-5)
+    assert beside.newest.t_us == capture.frame_times_us[-1]
     picture = Engine(weights("frame")).see([chunk(stream(9), frame=np.ones((20, 30)))])
     assert picture is not None
-    names = list(record.panels(replace(picture, so_far=beside.newest)))
+    names = list(record.panels(replace(picture, beside=beside.newest)))
     assert names == [*record.panels(picture), "of all so far"]
 
 
 def test_an_image_of_all_so_far_knows_what_it_needs(tiny_captures, tmp_path: Path) -> None:
     save_weights(tmp_path / "one.safetensors", weights("frame"))
     with pytest.raises(DataError, match="give weights of whole sequences"):
-        so_far_of(tmp_path / "one.safetensors", str(tiny_captures[0]))
+        so_far_of(tmp_path / "one.safetensors", open_live(str(tiny_captures[0])))
     write_events(tmp_path / "walk.raw", stream(500, 21))
     with pytest.raises(ConfigError, match="has to know the motion"):
-        so_far_of("near-event-sequence", str(tmp_path / "walk.raw"))
+        so_far_of("near-event-sequence", open_live(str(tmp_path / "walk.raw")))
     folder = tmp_path / "still"
     shutil.copytree(tiny_captures[0], folder)
     about = read_yaml(folder / "capture.yaml")
     save_yaml({key: value for key, value in about.items() if key != "motion"}, folder / "capture.yaml")
     with pytest.raises(DataError, match="states no motion"):
-        so_far_of("near-event-sequence", str(folder))
+        so_far_of("near-event-sequence", open_live(str(folder)))
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:

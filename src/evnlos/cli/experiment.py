@@ -1,16 +1,13 @@
-"""Commands that show and compare: `demo`, `experiment`, `app` and `live`.
+"""Commands that show and compare: `demo`, `experiment` and `live`.
 
 - `evnlos demo`: the main job, small.
 - `evnlos experiment`: a named comparison in, records and tables out.
-- `evnlos app`: a page to play with.
 - `evnlos live`: events as they come in, images out.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
@@ -21,15 +18,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from evnlos import experiment
-from evnlos.app.serve import Server, serve
 from evnlos.cli.parsing import UnfitWordsError, drawn, say
 from evnlos.cli.recordings import Flat
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_of
 from evnlos.demo import LAB_CHARACTERS, Demo, held_out, run_demo
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
-from evnlos.live.run import RateOptions, Run
-from evnlos.live.sources import SourceOptions, check_source, open_live, so_far_of
+from evnlos.live.run import RateOptions, Run, latency_table
+from evnlos.live.sources import SourceOptions, check_source, film_of, open_live, so_far_of
 from evnlos.machine import ProgressBars
 from evnlos.types import OutFolder
 
@@ -279,24 +275,7 @@ def _tables(name: str, records: list, metric: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-@dataclass(frozen=True)
-class AppCommand:
-    """A page to play with: hide something, choose wall and cameras, watch what can be seen; uploads too."""
-
-    weights: tuple[Path, ...] = ()
-    """Weights files, or folders of runs, that reconstruct beside the classical solvers; none takes those of
-    the package."""
-    server: Flat[Server] = field(default_factory=Server)
-
-    def run(self) -> None:
-        """Run the page until it is interrupted."""
-        with ProgressBars() as progress:
-            serve(self.server, self.weights, lambda at: print(f"{at}  (Ctrl+C stops it)", flush=True), progress)
-        say("stopped")  # while compiled code may be at work still, which the interpreter would tear apart
-        sys.stdout.flush()
-        os._exit(0)
-
-
+_FILM_CONFIDENCE = "no confidence: a film has an error of each cell (evnlos invert --changing), not shown here"
 _LIVE_CONFIDENCE = (
     "no confidence: live images are of single time steps; record the sequence (evnlos capture record), then "
     "evnlos reconstruct tells what it supports"
@@ -312,8 +291,8 @@ class LiveCommand:
     dvxplorer, centuryarks-vga or triton; NAME:SERIAL where several are connected); - for EVT2 or EVT3 words on
     standard input; udp://127.0.0.1:7000, aestream://127.0.0.1:3333, dv://127.0.0.1:7777."""
     weights: Path | None = None
-    """Weights file, run's folder, or name of published weights, of single positions; of the modality event
-    where SOURCE has no frames. None takes published ones: near-frame for a capture, else near-event."""
+    """Weights of single positions: file, run's folder, or name; of modality event where SOURCE has no frames.
+    None: near-frame for a capture, else near-event; with --changing none: networks know what moves as one."""
     headless: bool = False
     """Show no page; write the video and the latency table to --out."""
     out: OutFolder | None = None
@@ -325,6 +304,17 @@ class LiveCommand:
     so_far: Path | None = None
     """Weights of whole sequences (near-event-sequence): beside the image of the instant, one of all seen so
     far, as often as it is worth it. SOURCE is then a capture that states its motion."""
+    changing: tuple[float, float] | None = None
+    """Nothing moves as a whole: what a hidden plane of this width and height, metres, shows now, the newest
+    image of its film (as `invert --changing`), about the middle of the target plane of --setup."""
+    setup: Path | None = None
+    """With --changing: the setup, as for `invert`; a name, a settings file, or a folder of `calibrate`."""
+    evidence: Annotated[Literal["frames", "events", "both"], tyro.conf.arg(name="from")] = "frames"
+    """With --changing: what the film is made of."""
+    cells: int = 24
+    """With --changing: cells along the plane's longer side."""
+    newest: float = 3.0
+    """With --changing: seconds of the past that an image knows; with them grows the time that it takes."""
     threads: int = 1
     """Threads of the network; more are quicker only where cores have nothing else to do."""
     json: bool = False
@@ -337,6 +327,9 @@ class LiveCommand:
         check_source(self.source, self.listening.follow)
         if not 0 <= self.port <= 65_535:
             raise UnfitWordsError(f"--port is {self.port}; give 1 to 65535, or 0 for any that is free")
+        if (self.changing is None) != (self.setup is None) or (self.changing and self.so_far):
+            given = f"--changing is {self.changing}, --setup {self.setup}, --so-far {self.so_far}"
+            raise UnfitWordsError(f"{given}; give --changing WIDTH HEIGHT and --setup together, or --so-far")
 
     def run(self) -> None:
         """Show or record images until the source ends, and print how quick they were."""
@@ -344,39 +337,46 @@ class LiveCommand:
 
         from evnlos.analysis.identify import verdict_on
         from evnlos.analysis.model import load_model
-        from evnlos.data import load_pattern
+        from evnlos.data import pattern_of
+        from evnlos.inverse import film_plane
         from evnlos.live.display import Page, Recorder, check_folder
         from evnlos.live.engine import Engine
-        from evnlos.live.run import latency_table
         from evnlos.models import published_for
+        from evnlos.setups.load import linear_setup
 
+        self.check_names()
         if self.threads < 1:
             raise ConfigError(f"threads is {self.threads}; give at least 1")
         torch.set_num_threads(self.threads)
         out = self.out or (Path("live-out") if self.headless else None)
         if out is not None:
             check_folder(out)
-        name, recorder, beside = self.weights, None, None
+        name, recorder, beside, wall = self.weights, None, None, None
         model = None if name is None else load_model(name)
-        source = open_live(self.source, self.listening, load_pattern(self.pattern) if self.pattern else None)
+        source = open_live(self.source, self.listening, pattern_of(self.setup, self.pattern))
         try:
             with ExitStack() as stack:
-                if model is None:
+                if self.setup is not None and self.changing is not None:
+                    wall, plane = linear_setup(self.setup), film_plane(self.changing, self.cells)
+                    beside = film_of(wall, plane, source, self.evidence, self.newest)
+                elif model is None:
                     name = published_for(None, "frame" if source.has_frames else "event", is_motion_known=False)
                     model = load_model(name)
                     say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
-                engine = Engine(model.weights)
-                verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE, is_stated=False)
+                engine, why = Engine(model and model.weights), _LIVE_CONFIDENCE if model else _FILM_CONFIDENCE
+                wall, seen = (model.known_setup(), engine.modality.name) if model else (wall, "no network")
+                verdict = verdict_on(wall, None, why, is_stated=model is None)
+                verdict = verdict if model else replace(verdict, guessed="")  # no network draws
                 if self.so_far is not None:
-                    beside = so_far_of(self.so_far, self.source)
-                    say("what makes the images of all so far starts, which takes some seconds")
-                run = Run(source, engine, self.pace, so_far=beside)
+                    beside = so_far_of(self.so_far, source)
+                if beside is not None:
+                    say(f"what makes the images ({beside.title}) starts, which takes some seconds")
+                run = Run(source, engine, self.pace, beside=beside)
                 sinks = []
                 if not self.headless:
-                    title, again = f"{source.name}, {engine.modality.name}", getattr(source, "again", None)
+                    title, again = f"{source.name}, {seen}", getattr(source, "again", None)
                     told = lambda: run.statistics.now() | {"verdict": verdict.lines}  # noqa: E731
-                    page = stack.enter_context(Page(told, self.port, title, again))
-                    sinks.append(page)
+                    sinks.append(page := stack.enter_context(Page(told, self.port, title, again)))
                     say(f"{page.url} shows the images; Ctrl-C ends")
                     if source.waits:
                         page.wait_for_viewer(lambda: False)
@@ -386,8 +386,8 @@ class LiveCommand:
                 run.go(sinks)
         finally:
             source.close()
-        about = {"weights": str(name), "modality": engine.modality.name, "verdict": asdict(verdict)}
-        summary = run.statistics.summary() | about | ({"so_far": beside.summary()} if beside else {})
+        about = {"weights": name and str(name), "modality": seen, "verdict": asdict(verdict)}
+        summary = run.statistics.summary() | about | ({"beside": beside.summary()} if beside else {})
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
             write_atomically(out / "latency.json", (json.dumps(summary, indent=1) + "\n").encode())

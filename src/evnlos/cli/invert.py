@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 REGULARIZATION_TIKHONOV = 4.0  # best on eight characters of one setup, docs/inversion.md
 REGULARIZATION_TV = 0.3  # likewise
-_EXPLAINED = 2.0  # times the camera's noise that frames may keep
-_BRIGHTEST = 5.0  # by which cells of a plane may change that shines with 1
 
 
 _LEAST = dict.fromkeys(("cells", "columns"), 2) | dict.fromkeys(("subsets", "bin"), 1)
@@ -239,26 +237,19 @@ class InvertCommand:
     def _film(self, word: Path, sides_m: tuple[float, float]) -> None:
         from evnlos.cli.invert_captures import capture_of
         from evnlos.data import pattern_of
+        from evnlos.inverse import film_plane
         from evnlos.models import estimate_film_of
         from evnlos.plot.results import draw_inversion
         from evnlos.report.pictures import grey, save_animation
         from evnlos.setups.load import linear_setup
-        from evnlos.types import Plane
 
         refuse_existing(self.force, film := self.out.with_suffix(".gif"))
         if len(self.files) != 1 or self.samples or self.positions or self.track:
             raise ConfigError("--changing takes one capture; leave --samples, --positions, --track")
-        if not (min(sides_m) > 0 and max(sides_m) < np.inf and self.cells >= 2):
-            raise ConfigError(
-                f"--changing is {sides_m[0]:g} x {sides_m[1]:g} m of {self.cells} cells; give sides above 0 "
-                "and 2 cells or more"
-            )
+        plane = film_plane(sides_m, self.cells)
         clock = time.perf_counter()
         evidence = self.evidence or "frames"
         setup, capture = linear_setup(word), capture_of(self.files[0], evidence)
-        pitch = max(sides_m) / self.cells
-        across, down = (max(1, round(side / pitch)) for side in sides_m)
-        plane = Plane(down, across, pitch)
         pattern = None if evidence == "events" else pattern_of(word, self.pattern)
         how = evidence, pattern, self.columns, self.static
         with ProgressBars() as progress:
@@ -274,6 +265,7 @@ class InvertCommand:
             "prior": found.prior._asdict(),
             "noise_factor": found.noise_factor,
             "static": found.static,
+            "is_explained": found.is_explained,
             "evidence": found.evidence if evidence == "frames" else None,
             "picture": drawn(self.out, lambda: draw_inversion(self.out, panels)),
             "animation": str(film),
@@ -346,7 +338,7 @@ def film_text(found: dict[str, Any]) -> str:
     if found["from"] == "frames":
         noise = f"noise {found['noise_factor']:.2f} times the camera's"
         lines.append(f"{noise}, offsets {found['static']:.3g} times that")
-    if found["noise_factor"] > _EXPLAINED or prior["deviation"] > _BRIGHTEST:
+    if not found["is_explained"]:
         lines.append("warning: no plane here explains the frames; give a larger one, or check the setup")
     made = [found[name] for name in ("picture", "animation") if found.get(name)]
     return "\n".join([*lines, "; ".join([*made, f"{found['seconds']} s"])])

@@ -1,9 +1,10 @@
-"""Commands on networks: `train`, `finetune`, `evaluate`, `weights`.
+"""Commands on networks: `train`, `finetune`, `evaluate`, `weights`, `app`.
 
 - `evnlos train`: dataset or simulation in, run out.
 - `evnlos finetune`: run and dataset in, run out.
 - `evnlos evaluate`: weights and dataset in, scores beside their baselines out.
 - `evnlos weights`: what a weights file is, where it comes from, and a smaller copy to hand on.
+- `evnlos app`: a page to play with, and what networks make of it.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -19,6 +21,7 @@ import torch
 import tyro
 
 from evnlos.analysis import BASELINES, CHECKS, confusion
+from evnlos.app.serve import Server, serve
 from evnlos.cli.parsing import check_there, say, told_first
 from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, read_yaml, to_dict
@@ -357,3 +360,21 @@ def _scores(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path} is not what `evnlos evaluate --json` prints: {error!r}"[:300]) from None
     return kept | {"data": Path(kept["data"]).name, "psnr_db": objects, "baselines": baselines}
+
+
+@dataclass(frozen=True)
+class AppCommand:
+    """A page to play with: hide something, choose wall and cameras, watch what can be seen; uploads too."""
+
+    weights: tuple[Path, ...] = ()
+    """Weights files, or folders of runs, that reconstruct beside the classical solvers; none takes those of
+    the package."""
+    server: Flat[Server] = field(default_factory=Server)
+
+    def run(self) -> None:
+        """Run the page until it is interrupted."""
+        with ProgressBars() as progress:
+            serve(self.server, self.weights, lambda at: print(f"{at}  (Ctrl+C stops it)", flush=True), progress)
+        say("stopped")  # while compiled code may be at work still, which the interpreter would tear apart
+        sys.stdout.flush()
+        os._exit(0)

@@ -73,7 +73,7 @@ VERBS: dict[str, str] = {
     "convert": "recordings.ConvertCommand",
     "clean": "events.CleanCommand",
     "preview": "recordings.PreviewCommand",
-    "app": "experiment.AppCommand",
+    "app": "learning.AppCommand",
     "fetch": "about.FetchCommand",
     "cite": "about.CiteCommand",
     "doctor": "main.DoctorCommand",

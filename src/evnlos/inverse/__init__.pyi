@@ -4,6 +4,7 @@ from .changing import FilmEstimate as FilmEstimate
 from .changing import FilmPrior as FilmPrior
 from .changing import ModeSeries as ModeSeries
 from .changing import estimate_film as estimate_film
+from .changing import film_plane as film_plane
 from .changing import smooth_modes as smooth_modes
 from .corner import CornerImage as CornerImage
 from .corner import FloorSector as FloorSector

@@ -41,6 +41,8 @@ Array = NDArray[np.float64]
 _KEPT = 1e-13  # of the largest squared gain; what lies below is rounding
 _LENGTHS = (1 / 16, 1 / 4, 1)  # of correlation that are tried, over the plane's longer side
 LEAST_FRAMES = 3
+_EXPLAINED = 2.0  # times the camera's noise that frames may keep
+_BRIGHTEST = 5.0  # by which cells of a plane may change that shines with 1
 _LEAST_FREE = 30  # pixels more than modes, to tell what no plane explains
 
 
@@ -80,9 +82,38 @@ class FilmEstimate:
     noise_factor: float
     static: float
 
+    @property
+    def is_explained(self) -> bool:
+        """Whether a plane explains the frames: they keep little noise, and no cell shines far above white."""
+        return self.noise_factor <= _EXPLAINED and self.prior.deviation <= _BRIGHTEST
+
     def interval(self, deviations: float = 1.645) -> tuple[Array, Array]:
         """Return the lower and upper bound of each cell, [T, h, w] each; 1.645 deviations hold 90 %."""
         return self.mean - deviations * self.deviation, self.mean + deviations * self.deviation
+
+
+def film_plane(sides_m: tuple[float, float], cells: int) -> Plane:
+    """Return the hidden plane of a film, in square cells.
+
+    Args:
+        sides_m: Width and height, metres.
+        cells: Along the longer side.
+
+    Raises:
+        ConfigError: A side that is not above 0 and finite, or fewer than 2 cells.
+
+    Example:
+        >>> film_plane((0.2, 0.1), 24).shape
+        (12, 24)
+    """
+    if not (min(sides_m) > 0 and max(sides_m) < np.inf and cells >= 2):
+        raise ConfigError(
+            f"the plane that changes is {sides_m[0]:g} x {sides_m[1]:g} m of {cells} cells; give sides above 0 "
+            "and 2 cells or more"
+        )
+    pitch = max(sides_m) / cells
+    across, down = (max(1, round(side / pitch)) for side in sides_m)
+    return Plane(down, across, pitch)
 
 
 class ModeSeries(NamedTuple):

@@ -31,7 +31,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.cameras import CrossingLaw
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.changing import LEAST_FRAMES, FilmEstimate, FilmPrior, check_film, film_modes, wave_numbers
 from evnlos.inverse.event_likelihood import EventRows, LikelihoodSettings, rows_of
 from evnlos.inverse.event_record import EventRecord
@@ -145,7 +145,8 @@ class FilmFrames(NamedTuple):
     """What they tell alone, on the clock of the events (`estimate_film`): the prior, and the modes left out."""
 
 
-_MODES = 64  # strongest modes of a film that are asked for, at most
+MOST_MODES = 64
+"""Strongest modes of a film that events are asked for, at most."""
 _MOST, _FEWEST = 5000, 16  # unknowns of a film: what bounds the time; modes that are worth it
 _PIXELS = 256  # of a block
 _BRIGHT = 0.25  # mean brightness of the plane
@@ -165,13 +166,14 @@ def estimate_event_film(
     *,
     frames: FilmFrames | None = None,
     prior: FilmPrior | None = None,
+    modes: int = MOST_MODES,
     settings: LikelihoodSettings | None = None,
     progress: Progress = silent,
 ) -> FilmEstimate:
     """Return the film of a hidden plane from the events of the wall, and from frames beside them.
 
-    At most 64 of the strongest modes are asked for; the others are those of the frames alone, on a line from
-    one to the next, and what they may hold is part of the deviation.
+    At most `modes` of the strongest modes are asked for; the others are those of the frames alone, on a line
+    from one to the next, and what they may hold is part of the deviation.
 
     Args:
         operator: A, from the plane's cells to white levels of the event camera's pixels, [H, W].
@@ -182,15 +184,19 @@ def estimate_event_film(
         frames: Frames beside them; None = events alone.
         prior: The prior; None: that of the frames, or of bright shapes on black that move by a twentieth of the
             plane's side in a second. Its mean is a brightness of 0.25.
+        modes: Most modes, 1 or more; fewer where there are many nodes. Time grows with their cube.
         settings: What the likelihood of events takes for granted; None is the default.
         progress: Called with each iteration.
 
     Raises:
-        ConfigError: The operator's plane has no square cells, or a number of the prior is not positive.
+        ConfigError: The operator's plane has no square cells, a number of the prior is not positive, or there
+            are no modes.
         DataError: Times are not equally spaced or more than 312, or images do not fit their operators.
     """
     from scipy.linalg import cho_factor, cho_solve  # scipy loads slowly
 
+    if modes < 1:
+        raise ConfigError(f"modes is {modes}; give 1 or more")
     times, settings = np.asarray(times_s, np.float64), settings or LikelihoodSettings()
     steps = np.diff(times)
     if len(times) < LEAST_FRAMES or not (np.ptp(steps) <= 1e-6 * steps.max() and steps.min() > 0):
@@ -209,8 +215,8 @@ def estimate_event_film(
         prior = frames.film.prior
     found = prior or FilmPrior(_DEVIATION, _RESTING, side * _LENGTH, side * _SPEED)
     values, basis = film_modes(relative.T @ relative, plane, found.length_m)
-    modes = min(_MODES, _MOST // len(times), len(values))
-    if modes < min(_FEWEST, len(values)):
+    modes = min(modes, _MOST // len(times), len(values))
+    if _MOST // len(times) < min(_FEWEST, len(values)):
         raise DataError(
             f"{len(times)} images; give at most {_MOST // _FEWEST}: fewer a second, or a shorter recording"
         )

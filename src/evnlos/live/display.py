@@ -26,7 +26,7 @@ from PIL import Image
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import LOCK, check_folder, directory_lock, is_empty, new_file
-from evnlos.live.engine import Picture
+from evnlos.live.run import Picture
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
 from evnlos.untrusted import names_this_machine
 
@@ -36,21 +36,20 @@ _HEIGHT_PX, _GAP_PX = 256, 8
 def panels(picture: Picture) -> dict[str, NDArray[np.uint8]]:
     """Return what there is to see, by name, in the order of the light path: uint8 [H, W] or [H, W, 3]."""
     shown = {"wall": stretched(picture.frame)} if picture.frame is not None else {}
-    shown |= {"events": polarity(picture.surface), "reconstruction": grey(picture.image)}
-    return shown if picture.so_far is None else shown | {"of all so far": grey(picture.so_far)}
+    shown["events"] = polarity(picture.surface)
+    shown |= {} if picture.image is None else {"reconstruction": grey(picture.image)}
+    return shown | ({picture.beside.title: grey(picture.beside.image)} if picture.beside else {})
 
 
 def side_by_side(picture: Picture) -> NDArray[np.uint8]:
-    """Return the panels as one colour image [H, W, 3] of even sides, magnified to about 256 rows."""
-    zoom = max(1, round(_HEIGHT_PX / picture.image.shape[0]))
-    row: list[NDArray[np.uint8]] = []
-    for panel in panels(picture).values():
-        colour = panel if panel.ndim == 3 else np.repeat(panel[..., None], 3, axis=-1)
-        row += [colour.repeat(zoom, axis=0).repeat(zoom, axis=1)]
-        row += [np.full((row[-1].shape[0], _GAP_PX, 3), 128, np.uint8)]
-    sheet = np.concatenate(row[:-1], axis=1)
-    odd = sheet.shape[0] % 2, sheet.shape[1] % 2  # video codecs take even sides
-    return np.pad(sheet, ((0, odd[0]), (0, odd[1]), (0, 0)), mode="edge")
+    """Return the panels as one colour image [H, W, 3] of even sides, each magnified to about 256 rows."""
+    shown = panels(picture).values()
+    row = [one if one.ndim == 3 else np.repeat(one[..., None], 3, axis=-1) for one in shown]
+    row = [one.repeat(k := max(1, round(_HEIGHT_PX / len(one))), axis=0).repeat(k, axis=1) for one in row]
+    rows = max(len(one) + len(one) % 2 for one in row)
+    row = [np.pad(one, ((0, rows - len(one)), (0, _GAP_PX), (0, 0)), constant_values=128) for one in row]
+    sheet = np.concatenate(row, axis=1)[:, :-_GAP_PX]
+    return np.pad(sheet, ((0, 0), (0, sheet.shape[1] % 2), (0, 0)), mode="edge")  # video codecs take even sides
 
 
 _HOST = "127.0.0.1"
@@ -164,11 +163,12 @@ class Page:
         """Return an image as one line of JSON; encoded once for all viewers."""
         with self._encoding:
             if self._message[0] != picture.number:
-                latency = picture.timing.oldest_s
+                latency, age_s = picture.timing.oldest_s, picture.beside_age_s
                 about = {
                     "number": picture.number,
                     "t_s": round(picture.t_us / 1e6, 4),
                     "latency_ms": round(latency * 1e3, 1) if latency == latency else None,
+                    "beside_age_s": None if age_s is None else round(age_s, 2),
                     "panels": {name: data_uri(png(panel)) for name, panel in panels(picture).items()},
                 }
                 self._message = picture.number, json.dumps(about).encode()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,10 +17,12 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from evnlos.data import Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import TRACE_TAUS, RunningTrace
 from evnlos.events import surface as kernels
 from evnlos.live.packet import UNKNOWN_US, Chunk, Clock, SystemClock
+from evnlos.live.run import Picture, Timing
 from evnlos.models import Weights, published_single
 from evnlos.types import Events
 
@@ -169,54 +170,6 @@ class RunningSurface:
 _WARM = 8  # the graph is optimised in its first calls
 
 
-@dataclass(frozen=True)
-class Timing:
-    """How long an image took, seconds; NaN for both latencies where no event is new in it.
-
-    Args:
-        oldest_s: From the first event that is new in it to the image: the longest that an event waited.
-        newest_s: From its last event to the image.
-        wait_s: The part of `oldest_s` before work on the image began: in the source, in the queue, for the
-            image before.
-        surface_s: Taking the events and making the maps that the network sees.
-        network_s: The network.
-    """
-
-    oldest_s: float
-    newest_s: float
-    wait_s: float
-    surface_s: float
-    network_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A reconstruction and what it was made of.
-
-    Args:
-        number: Its number, from 0.
-        t_us: Event time that it shows, microseconds.
-        made_s: Instant at which it was ready, seconds on the `Clock`.
-        image: The reconstruction, float32 [H, W], 0..1.
-        surface: The time surface that the network saw, float32 [2, H, W]: ON, OFF; 4 maps of `sae-trace`.
-        frame: The frame that it saw, float32 [H, W], 0..1; None without frames.
-        events: Number of events that are new in it.
-        timing: How long it took.
-        so_far: The newest image of all that was seen so far, float32 [H, W], 0..1, black before the first; None
-            where none is made.
-    """
-
-    number: int
-    t_us: int
-    made_s: float
-    image: NDArray[np.float32]
-    surface: NDArray[np.float32]
-    frame: NDArray[np.float32] | None
-    events: int
-    timing: Timing
-    so_far: NDArray[np.float32] | None = None
-
-
 class StreamingReconstructor:
     """A network of single time steps: the same images as `reconstruct`, without Python between its layers.
 
@@ -282,7 +235,7 @@ class Engine:
     newest frame, where it sees frames too; one that sees frames alone makes one image per frame.
 
     Args:
-        weights: Network, modality and sampling.
+        weights: Network, modality and sampling; None: no network, what the cameras see alone.
         clock: The clock that it goes by.
 
     Raises:
@@ -300,9 +253,10 @@ class Engine:
         ((16, 24), 9, 2)
     """
 
-    def __init__(self, weights: Weights, clock: Clock | None = None) -> None:
-        self._see = StreamingReconstructor(weights)
-        self.modality, self.sampling = weights.modality, self._see.sampling
+    def __init__(self, weights: Weights | None, clock: Clock | None = None) -> None:
+        self._see = None if weights is None else StreamingReconstructor(weights)
+        self.modality = as_modality("event") if weights is None else weights.modality
+        self.sampling = Sampling() if weights is None else weights.sampling
         if self.sampling.surface not in ("sae", "sae-trace"):
             raise ConfigError(
                 f"the weights take the surface {self.sampling.surface!r}; live reconstruction makes 'sae' and "
@@ -333,7 +287,7 @@ class Engine:
         one = Events(np.array([1]), place, place, np.array([True]), self._shape[1], self._shape[0])
         self._take(Chunk(one, 1, 0.0, 0.0))
         for _ in range(_WARM):
-            self._see(self._dark, self._maps())
+            self._image(self._maps())
         self._forget()
 
     def _maps(self) -> NDArray[np.float32]:
@@ -343,6 +297,12 @@ class Engine:
         if self._trace is not None:
             found = np.concatenate([found, self._trace.at(self._until_us)])
         return self._reduce(found)
+
+    def _image(self, surface: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Return what the network makes of the surface and the newest frame; None without one."""
+        if self._see is None:
+            return None
+        return self._see(self._dark if self._frame is None else self._frame, surface).numpy()
 
     def see(self, chunks: Sequence[Chunk]) -> Picture | None:
         """Take chunks in their order and return the image behind them; None where there is none to be made.
@@ -370,7 +330,7 @@ class Engine:
             return None
         surface = self._maps()
         mapped_s = self._clock.now()
-        image = self._see(self._dark if self._frame is None else self._frame, surface).numpy()
+        image = self._image(surface)
         made_s = self._clock.now()
         timing = Timing(
             made_s - oldest_s, made_s - newest_s, begun_s - oldest_s, mapped_s - begun_s, made_s - mapped_s

@@ -1,19 +1,22 @@
 """A live run, and its statistics.
 
+- An image of a live run, and how long it took.
 - What a live run did: images, latencies, drops, rates; as numbers and as a table.
-- The image of all that was seen so far, made beside a run in a process of its own, as often as it is worth it.
+- Images of what was seen over a longer time, made beside a run in a process of their own: of all so far by a
+  network, or of a hidden plane that changes.
 - A live run: the source fills a queue in its own thread, the network empties it, sinks get the images.
 """
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +29,73 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from evnlos.live.engine import Engine, Picture
-    from evnlos.models import Weights
+    from evnlos.models import FilmSolver, Weights
     from evnlos.scene import Motion
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long an image took, seconds; NaN for both latencies where no event is new in it.
+
+    Args:
+        oldest_s: From the first event that is new in it to the image: the longest that an event waited.
+        newest_s: From its last event to the image.
+        wait_s: The part of `oldest_s` before work on the image began: in the source, in the queue, for the
+            image before.
+        surface_s: Taking the events and making the maps that the network sees.
+        network_s: The network.
+    """
+
+    oldest_s: float
+    newest_s: float
+    wait_s: float
+    surface_s: float
+    network_s: float
+
+
+class BesideImage(NamedTuple):
+    """The newest image of what was seen over a longer time, made beside a run."""
+
+    title: str
+    """What it shows."""
+    image: NDArray[np.float32]
+    """Float32 [H, W], 0..1; black before the first."""
+    t_us: int | None
+    """Event time up to which it knows what was seen, microseconds; None before the first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A reconstruction and what it was made of.
+
+    Args:
+        number: Its number, from 0.
+        t_us: Event time that it shows, microseconds.
+        made_s: Instant at which it was ready, seconds on the `Clock`.
+        image: The reconstruction, float32 [H, W], 0..1; None without a network.
+        surface: The time surface that the network saw, float32 [2, H, W]: ON, OFF; 4 maps of `sae-trace`.
+        frame: The frame that it saw, float32 [H, W], 0..1; None without frames.
+        events: Number of events that are new in it.
+        timing: How long it took.
+        beside: The newest image of what was seen over a longer time; None where none is made.
+    """
+
+    number: int
+    t_us: int
+    made_s: float
+    image: NDArray[np.float32] | None
+    surface: NDArray[np.float32]
+    frame: NDArray[np.float32] | None
+    events: int
+    timing: Timing
+    beside: BesideImage | None = None
+
+    @property
+    def beside_age_s(self) -> float | None:
+        """Event time that went by since what the image beside it knows, seconds; None before the first."""
+        known_us = None if self.beside is None else self.beside.t_us
+        return None if known_us is None else max(self.t_us - known_us, 0) / 1e6
+
 
 _KEPT = 100_000  # images whose times are kept: half an hour at 50 a second, 6 MB
 _RECENT = 100
@@ -55,6 +123,7 @@ class RunStatistics:
         self._source, self._queue = source, queue
         self._times: deque[tuple[float, ...]] = deque(maxlen=_KEPT)
         self._recent: deque[tuple[float, int, float]] = deque(maxlen=_RECENT)
+        self._ages_s: deque[float] = deque(maxlen=_KEPT)
         self.images = self.events = 0
         self._first: tuple[float, int] | None = None  # instant and events of the first image
         self._last_s = 0.0
@@ -64,6 +133,8 @@ class RunStatistics:
         t = picture.timing
         self._times.append((t.oldest_s, t.newest_s, t.wait_s, t.surface_s, t.network_s))
         self._recent.append((picture.made_s, picture.events, t.oldest_s))
+        if picture.beside_age_s is not None:
+            self._ages_s.append(picture.beside_age_s)
         self.images += 1
         self.events += picture.events
         self._first = self._first or (picture.made_s, picture.events)
@@ -104,6 +175,7 @@ class RunStatistics:
             "events_hz": round((self.events - first_events) / seconds) if seconds else 0,
             **self._losses(),
             "latency_ms": {name: _spread(times[:, k]) for k, name in enumerate(ROWS)},
+            **({"beside_age_s": _spread(np.array(self._ages_s))} if self._ages_s else {}),
         }
 
 
@@ -130,7 +202,12 @@ def latency_table(summary: dict[str, Any]) -> str:
     lines.append(f"{images} of {events} in {summary['seconds']:.1f} s")
     dropped, faults = summary["dropped"], _listed(summary["faults"].items())
     lines.append(f"dropped by the queue: {dropped['events']:,} events in {dropped['chunks']:,} chunks")
-    return "\n".join([*lines, *([f"left out by the source: {faults}"] if faults else [])])
+    lines += [f"left out by the source: {faults}"] if faults else []
+    if (beside := summary.get("beside")) is not None:
+        age = summary.get("beside_age_s")
+        old = f"; when shown {age['p50']:.1f} s old in the median, {age['max']:.1f} at most" if age else ""
+        lines.append(f"{beside['title']}: {beside['images']} images of {beside['seconds']:.2f} s each{old}")
+    return "\n".join(lines)
 
 
 def _listed(faults: Iterable[tuple[str, int]]) -> str:
@@ -160,6 +237,12 @@ class RateOptions:
             raise ConfigError(f"seconds is {self.seconds}; give a positive number")
 
 
+Evidence = Literal["frames", "events", "both"]
+"""What a film is made of."""
+Made = tuple[NDArray[np.float32], int]
+"""An image, float32 [H, W], 0..1, and the event time up to which it knows what was seen, microseconds."""
+
+
 class ImagesSoFar:
     """Images of all that was seen so far, by a network of whole sequences, one after the other.
 
@@ -182,7 +265,7 @@ class ImagesSoFar:
     ) -> None:
         from evnlos.inverse import RunningEventImages
 
-        _check_sequence(weights)
+        check_sequence(weights)
         sampling = weights.sampling
         self._network = weights.network.seeing(replace(sampling, surface="so-far")).eval()
         self._modality, self._motion, self._canvas = weights.modality, motion, sampling.canvas
@@ -196,8 +279,8 @@ class ImagesSoFar:
         if self._events is not None:
             self._events.begin()
 
-    def after(self, chunks: Sequence[Chunk]) -> NDArray[np.float32] | None:
-        """Take what came and return the image, float32 [H, W], 0..1; None where there is none to be made.
+    def after(self, chunks: Sequence[Chunk]) -> Made | None:
+        """Take what came and return the image; None where there is none to be made.
 
         Raises:
             DataError: The target is off the canvas.
@@ -227,10 +310,52 @@ class ImagesSoFar:
         with torch.inference_mode():
             place = torch.from_numpy(at.astype(np.float32))
             seen = self._modality.inputs(np.stack(frames), surface)
-            return self._network.draw(seen, place, place[-1:])[0].numpy()
+            return self._network.draw(seen, place, place[-1:])[0].numpy(), times_us[-1]
 
 
-def _check_sequence(weights: Weights) -> None:
+class FilmImages:
+    """What a hidden plane that changes shows now, by `evnlos.models.RunningFilm`.
+
+    Args:
+        solver: Of `RunningFilm`, as the next two.
+        evidence: What the film is made of.
+        newest_s: How much of the past an image knows, seconds.
+        size: Rows and columns of the cameras, whose light paths are made at once; None: with the first image.
+    """
+
+    def __init__(
+        self, solver: FilmSolver, evidence: Evidence, newest_s: float, size: tuple[int, int] | None
+    ) -> None:
+        from evnlos.models import RunningFilm
+
+        self._film = RunningFilm(solver, evidence, newest_s)
+        if size is not None:
+            for frames in (True, False):
+                if evidence in ("both", "frames" if frames else "events"):
+                    solver.path(size, frames)
+
+    def after(self, chunks: Sequence[Chunk]) -> Made | None:
+        """Take what came and return the newest image; None where too little came.
+
+        Raises:
+            EvnlosError: The film cannot be estimated.
+        """
+        for chunk in chunks:
+            if chunk.restart:
+                self._film.forget()
+            self._film.add(chunk.events, chunk.until_us, chunk.frame, chunk.frame_us)
+        return self._film.newest()
+
+
+def check_sequence(weights: Weights) -> None:
+    """Refuse weights that make no image of all that was seen so far.
+
+    Args:
+        weights: The weights.
+
+    Raises:
+        DataError: They see single time steps, or surfaces that are no likelihood.
+    """
     if not weights.network.sees_sequence or (weights.modality.needs_events and not weights.sampling.is_solved):
         raise DataError(
             "these weights do not see what all events and frames so far say of the target; give weights of "
@@ -238,15 +363,18 @@ def _check_sequence(weights: Weights) -> None:
         )
 
 
-_held: ImagesSoFar | None = None  # of a process beside a run
+_NICE = 5  # of the process beside a run, which comes first
+_held: ImagesSoFar | FilmImages | None = None  # of a process beside a run
 
 
-def _hold(*about: Any) -> None:
+def _hold(make: type[ImagesSoFar | FilmImages], *about: Any) -> None:
     global _held
-    _held = ImagesSoFar(*about)
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    _held = make(*about)
 
 
-def _timed(chunks: Sequence[Chunk]) -> tuple[NDArray[np.float32] | None, float]:
+def _timed(chunks: Sequence[Chunk]) -> tuple[Made | None, float]:
     assert _held is not None
     began_s = time.perf_counter()
     return _held.after(chunks), time.perf_counter() - began_s
@@ -255,35 +383,42 @@ def _timed(chunks: Sequence[Chunk]) -> tuple[NDArray[np.float32] | None, float]:
 _FEWEST_EVENTS = 500  # for the first image
 
 
-class SoFar:
-    """`ImagesSoFar` beside a run, in a process of their own: the run's images wait for none of them.
+class Beside:
+    """Images of a longer time beside a run, in a process of their own: the run waits for none of them.
 
     Args:
-        weights: As for `ImagesSoFar`.
-        about: Its other arguments.
+        title: What they show.
+        make: What makes them.
+        about: Its arguments.
+        shape: Rows and columns of the images.
+        sees_events: Whether events make an image worth it, and not frames.
+        worth: An image is begun when there are so many times as many of these as in the last one, and more.
 
     Attributes:
+        title: What they show.
         seconds: How long each image took.
-
-    Raises:
-        DataError: The weights do not fit.
     """
 
-    def __init__(self, weights: Weights, *about: Any) -> None:
-        from evnlos.inverse.event_images import WORTH  # which compiles
-
-        _check_sequence(weights)
-        self._worth = WORTH
-        self._about, self._ending = (weights, *about), ExitStack()
-        self._sees_events = weights.modality.needs_events
+    def __init__(
+        self,
+        title: str,
+        make: type[ImagesSoFar | FilmImages],
+        about: tuple[Any, ...],
+        shape: tuple[int, int],
+        sees_events: bool,
+        worth: float = 1.0,
+    ) -> None:
+        self.title, self._about, self._ending = title, (make, *about), ExitStack()
+        self._sees_events, self._worth = sees_events, worth
         self.seconds = list[float]()
         self._fault: DataError | None = None
         self._waiting, self._count, self._known = list[Chunk](), 0, 0
-        self._at_work: Future[tuple[NDArray[np.float32] | None, float]] | None = None
-        self._image = np.zeros(weights.sampling.canvas.shape, np.float32)
+        self._at_work: Future[tuple[Made | None, float]] | None = None
+        self._blank = BesideImage(title, np.zeros(shape, np.float32), None)
+        self._image = self._blank
 
     def begin(self) -> None:
-        """Start the process and wait until it is ready; errors are those of `ImagesSoFar`."""
+        """Start the process and wait until it is ready; errors are those of what makes the images."""
         from evnlos.data.pool import one_worker
 
         self._worker = self._ending.enter_context(one_worker())
@@ -294,11 +429,12 @@ class SoFar:
         for chunk in chunks:
             if chunk.restart:
                 self._count = self._known = 0
-                self._image = np.zeros_like(self._image)
+                self._image = self._blank
             self._waiting.append(chunk)
             self._count += len(chunk.events) if self._sees_events else chunk.frame is not None
         self._take_if_done()
-        least = max(_FEWEST_EVENTS, self._worth * self._known) if self._sees_events else self._known + 1
+        fewest = _FEWEST_EVENTS if self._sees_events else 1
+        least = max(fewest, self._known + 1, self._worth * self._known)
         if self._at_work is None and self._count >= least:
             self._begin_image()
 
@@ -307,8 +443,8 @@ class SoFar:
         self._waiting = []
 
     @property
-    def newest(self) -> NDArray[np.float32]:
-        """The newest image, float32 [H, W], 0..1; black before the first."""
+    def newest(self) -> BesideImage:
+        """The newest image; black before the first."""
         self._take_if_done()
         return self._image
 
@@ -320,12 +456,12 @@ class SoFar:
         assert self._at_work is not None
         done, self._at_work = self._at_work, None
         try:
-            image, seconds = done.result()
+            made, seconds = done.result()
         except DataError as error:  # the target is off the canvas yet
             self._fault = error
             return
-        if image is not None and self._known:  # else the replay began anew meanwhile
-            self._image = image
+        if made is not None and self._known:  # else the replay began anew meanwhile
+            self._image = BesideImage(self.title, *made)
             self.seconds.append(seconds)
 
     def finish(self) -> None:
@@ -347,8 +483,9 @@ class SoFar:
         self._ending.close()
 
     def summary(self) -> dict[str, Any]:
-        """Return how many images there were, and the median of their times, seconds."""
-        return {"images": len(self.seconds), "seconds": round(float(np.median(self.seconds or [0.0])), 3)}
+        """Return what they show, how many there were, and the median of their times, seconds."""
+        seconds = round(float(np.median(self.seconds or [0.0])), 3)
+        return {"title": self.title, "images": len(self.seconds), "seconds": seconds}
 
 
 class Sink(Protocol):
@@ -367,7 +504,7 @@ class Run:
         engine: What makes images of them.
         pace: How often, and how much may wait.
         clock: The clock that it goes by.
-        so_far: What makes the image of all so far beside it.
+        beside: What makes images of a longer time beside it.
 
     Attributes:
         statistics: What it did so far.
@@ -382,14 +519,14 @@ class Run:
         engine: Engine,
         pace: RateOptions = RateOptions(),
         clock: Clock | None = None,
-        so_far: SoFar | None = None,
+        beside: Beside | None = None,
     ) -> None:
         if engine.needs_frames and not source.has_frames:
             raise DataError(
                 f"weights of the modality {engine.modality.name!r} see frames and {source.name} has none; give "
                 "the folder of a capture, or weights of the modality 'event'"
             )
-        self._source, self._engine, self._pace, self._so_far = source, engine, pace, so_far
+        self._source, self._engine, self._pace, self._beside = source, engine, pace, beside
         self._clock = clock or SystemClock()
         self._queue = ChunkQueue(pace.queue_events)
         self._stop = threading.Event()
@@ -405,10 +542,10 @@ class Run:
         Raises:
             EvnlosError: The source can't go on; earlier images were made.
         """
-        sinks, so_far, last = list(sinks), self._so_far, None
+        sinks, beside, last = list(sinks), self._beside, None
+        if beside is not None:
+            beside.begin()
         self._engine.begin()
-        if so_far is not None:
-            so_far.begin()
         start_s = due_s = self._clock.now()
         pump = threading.Thread(target=self._pump, name="source", daemon=True)
         pump.start()
@@ -422,9 +559,9 @@ class Run:
                 chunks = self._queue.take(_NAP_S)
                 taken_s = self._clock.now()
                 picture = self._engine.see(chunks) if chunks else None
-                if so_far is not None:
-                    so_far.add(chunks)
-                    picture = picture and replace(picture, so_far=so_far.newest)
+                if beside is not None:
+                    beside.add(chunks)
+                    picture = picture and replace(picture, beside=beside.newest)
                 if picture is not None:
                     last = picture
                     due_s = taken_s + 1 / self._pace.rate
@@ -432,10 +569,10 @@ class Run:
                     for sink in sinks:
                         sink.show(picture)
             self._queue.take(0)  # raises what ended the source
-            if so_far is not None:
-                so_far.finish()
+            if beside is not None:
+                beside.finish()
                 if last is not None:
-                    whole = replace(last, number=last.number + 1, so_far=so_far.newest)
+                    whole = replace(last, number=last.number + 1, beside=beside.newest)
                     for sink in sinks:
                         sink.show(whole)
         except KeyboardInterrupt:
@@ -443,8 +580,8 @@ class Run:
         finally:
             self._stop.set()
             pump.join(timeout=2)
-            if so_far is not None:
-                so_far.close()
+            if beside is not None:
+                beside.close()
         return self.statistics
 
     def _pump(self) -> None:

@@ -23,15 +23,18 @@ from evnlos.events.recording import CropOptions, Recording
 from evnlos.live.device import DEVICES, DeviceSource, NeuromorphicDriver, device_of
 from evnlos.live.growing_file import GrowingFile
 from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
-from evnlos.live.run import SoFar
+from evnlos.live.run import Beside, Evidence, FilmImages, ImagesSoFar, check_sequence
 from evnlos.live.streams import DvSource, WordInput
 from evnlos.live.udp import AestreamSource, UdpSource
-from evnlos.types import Events
+from evnlos.types import Events, Plane
 
 if TYPE_CHECKING:
+    from evnlos.data import Capture
     from evnlos.data.fixed_pattern import FixedPattern
+    from evnlos.setups import Setup
 
 _NAP_S = 0.05  # longest sleep before `stop` is asked again
+_FILM_MODES = 24  # of a film that events tell, which may take seconds and not minutes
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,7 @@ class Replay:
 
     Attributes:
         again: Set it, and the replay begins again.
+        capture: The capture that is replayed; None of any other recording.
 
     Raises:
         ConfigError: Speed or step are outside their range.
@@ -89,6 +93,7 @@ class Replay:
         self._pieces, self._frames, self._clock = pieces, list(frames), clock or SystemClock()
         self._speed, self._step_us = speed, max(round(step_s * 1e6 * speed), 1)
         self._repeat, self.again = repeat, threading.Event()
+        self.capture: Capture | None = None
 
     def faults(self) -> dict[str, int]:
         """Return nothing: a recording is checked when it is opened."""
@@ -304,35 +309,74 @@ def capture_replay(
         images = capture.frames / np.float32(capture.peak)
     times = capture.frame_times_us[: len(images)]
     frames = [TimedFrame(int(t), image) for t, image in zip(times, images, strict=True)]
-    return Replay([capture.events], frames, speed=speed, clock=clock, name=str(folder), repeat=repeat)
+    replay = Replay([capture.events], frames, speed=speed, clock=clock, name=str(folder), repeat=repeat)
+    replay.capture = capture
+    return replay
 
 
-def so_far_of(weights: str | Path, source: str) -> SoFar:
+def so_far_of(weights: str | Path, source: EventSource) -> Beside:
     """Return what makes the image of all that was seen so far of a capture that is replayed.
 
     Args:
         weights: Weights of whole sequences: a file, a run's folder, or a name.
-        source: The capture's folder.
+        source: The replay.
 
     Raises:
         ConfigError: The source is no capture.
         DataError: The capture states no motion, or lacks what the network sees; or the weights do not fit.
     """
-    from evnlos.data import read_capture
+    from evnlos.inverse.event_images import WORTH  # which compiles
     from evnlos.models import load_weights
 
-    if not (Path(source) / "capture.yaml").is_file():
+    capture = source.capture if isinstance(source, Replay) else None
+    if capture is None:
         raise ConfigError(
-            f"--so-far with {source}: an image of all seen so far has to know the motion; give the folder of a "
-            "capture that states it"
+            f"--so-far with {source.name}: an image of all seen so far has to know the motion; give the folder "
+            "of a capture that states it"
         )
-    loaded, capture = load_weights(weights), read_capture(source, needs_frames=False, needs_events=False)
+    loaded = load_weights(weights)
+    check_sequence(loaded)
     eyes = loaded.modality
     capture.info.check_cameras(capture.name, frames=eyes.needs_frames, events=eyes.needs_events)
     if capture.motion is None:
-        raise DataError(f"{source} states no motion; --so-far needs it (`evnlos track` finds it)")
-    first_us, last_us = (int(capture.frame_times_us[k]) for k in (0, -1))
-    return SoFar(loaded, capture.motion, (first_us, last_us), capture.events.shape)
+        raise DataError(f"{source.name} states no motion; --so-far needs it (`evnlos track` finds it)")
+    span_us = int(capture.frame_times_us[0]), int(capture.frame_times_us[-1])
+    about = loaded, capture.motion, span_us, capture.events.shape
+    worth = WORTH if eyes.needs_events else 1.0
+    shape = loaded.sampling.canvas.shape
+    return Beside("of all so far", ImagesSoFar, about, shape, eyes.needs_events, worth)
+
+
+def film_of(
+    setup: Setup,
+    plane: Plane,
+    source: EventSource,
+    evidence: Evidence = "frames",
+    newest_s: float = 3.0,
+) -> Beside:
+    """Return what makes the newest image of a hidden plane that changes, beside a run.
+
+    Args:
+        setup: The setup, linear.
+        plane: The hidden plane, about the middle of the setup's.
+        source: What is reconstructed.
+        evidence: What the film is made of.
+        newest_s: How much of the past an image knows, seconds.
+
+    Raises:
+        ConfigError: The seconds are too few, or the event model states no law of its crossings.
+        DataError: The source has no frames, and they are to be seen.
+    """
+    from evnlos.models import FilmSolver, RunningFilm
+
+    if evidence != "events" and not source.has_frames:
+        raise DataError(f"{source.name} has no frames; give --from events, or a source with frames")
+    if evidence != "frames":
+        setup.pixel.known_law(1.0)
+    about = FilmSolver(setup, plane, modes=_FILM_MODES), evidence, newest_s
+    RunningFilm(*about)  # refuses what cannot be
+    size = source.capture.events.shape if isinstance(source, Replay) and source.capture else None
+    return Beside("plane that changes", FilmImages, (*about, size), plane.shape, evidence == "events")
 
 
 def _address(source: str) -> tuple[str, int]:

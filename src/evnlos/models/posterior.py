@@ -39,11 +39,12 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data import Capture, FixedPattern
 from evnlos.data.fixed_pattern import object_light, own_pixels
-from evnlos.errors import ConfigError, UnknownNameError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse import (
     TRACKED_ROOM,
     FilmEstimate,
     FilmFrames,
+    FilmPrior,
     FrameTerm,
     PatternPrior,
     SequenceEstimate,
@@ -54,13 +55,17 @@ from evnlos.inverse import (
     estimate_sequence,
     record_of,
 )
+from evnlos.inverse.changing import LEAST_FRAMES
+from evnlos.inverse.event_film import MOST_MODES
 from evnlos.inverse.event_images import COEFFICIENTS, event_prior
+from evnlos.inverse.sequence_problem import matrix_of
 from evnlos.machine import Progress, note, silent
 from evnlos.models.unet import ResidualUNet, UNetConfig
 from evnlos.models.weights import weights_folders
+from evnlos.optics import MatrixTransport
 from evnlos.setups import Setup
 from evnlos.tensor_file import TensorFile
-from evnlos.types import Colour, Plane
+from evnlos.types import Colour, Events, Plane
 
 SPREAD = 0.5
 """Standard deviation that inputs of the network are scaled by; of bright and dark cells in equal parts."""
@@ -389,6 +394,174 @@ def estimate_target(
 _FILM_STEP_S = 0.1  # between images of a film that events tell
 
 
+class FilmSolver:
+    """Films of a hidden plane that changes, from what cameras see of its wall; the light path is made once.
+
+    Args:
+        setup: The setup, linear.
+        plane: The hidden plane, about the middle of the setup's.
+        columns: Columns to which frames are reduced, pixels.
+        modes: Most modes that events are asked for; time grows with their cube.
+    """
+
+    def __init__(self, setup: Setup, plane: Plane, columns: int = 64, modes: int = MOST_MODES) -> None:
+        self.setup, self.plane, self._columns, self._modes = setup, plane, columns, modes
+        self._paths = dict[tuple[tuple[int, int], bool], MatrixTransport]()
+
+    def path(self, size: tuple[int, int], frames: bool) -> MatrixTransport:
+        """Return the light path to a camera, which is made once.
+
+        Args:
+            size: Its rows and columns, pixels.
+            frames: Whether its images are reduced, as frames are.
+        """
+        if (size, frames) not in self._paths:
+            across = min(self._columns, size[1]) if frames else size[1]
+            shape = (max(1, round(size[0] * across / size[1])), across)
+            self._paths[size, frames] = matrix_of(self.setup.seen_by(size).operator(self.plane, shape))
+        return self._paths[size, frames]
+
+    def film(
+        self,
+        times_s: NDArray[np.float64],
+        frames: NDArray | None = None,
+        events: Events | None = None,
+        *,
+        peak: float = 1.0,
+        pattern: FixedPattern | None = None,
+        static: float | None = None,
+        prior: FilmPrior | None = None,
+        begins: bool = True,
+        count: int | None = None,
+        progress: Progress = silent,
+    ) -> FilmEstimate:
+        """Return the film that frames, events, or both tell.
+
+        Args:
+            times_s: Times of the frames, [N], seconds; without frames the first and last instant count, and how
+                many there are.
+            frames: Digital numbers [N, H, W]; None: events alone.
+            events: On the clock of the frames; None: frames alone.
+            peak: Digital number of white.
+            pattern: Fixed pattern of the frame camera, to be taken off.
+            static: Standard deviation of a pixel's constant offset over its noise's; None: as the frames say.
+            prior: The prior; None: as the frames say, or the one of events alone.
+            begins: Whether the pixels of the event camera start with the first instant, or saw events before.
+            count: How many images events tell, from the first time to the last; None: one every tenth of a
+                second, or as many as times where these are more.
+            progress: Told the iterations.
+
+        Raises:
+            ConfigError: The event model states no law of its crossings.
+            DataError: Too few frames, or too many images.
+        """
+        setup, beside = self.setup, None
+        if frames is not None:
+            height, width = frames.shape[1:]
+            operator = self.path((height, width), frames=True)
+            shape = operator.shape
+            light = object_light(frames, peak, setup, shape, pattern).double()
+            level = light.mean(dim=0) + setup.ambient_light(shape)
+            averaged = height * width / (shape[0] * shape[1])  # of the sensor's pixels, each with its own noise
+            noise = (setup.frame_camera.noise_variance(level) / averaged).sqrt()
+            found = estimate_film(operator, light, times_s, noise, static=static, prior=prior)
+            if events is None:
+                return found
+            beside = FilmFrames(operator, light, noise, found)
+        if events is None:
+            raise DataError("there are neither frames nor events; give one of them")
+        size, span = events.shape, (float(times_s[0]), float(times_s[-1]))
+        still = setup.seen_by(size).ambient_light(size)
+        law = setup.pixel.known_law(WHITE_DN * float(still.mean()))
+        law = replace(law, starts_at_rest=law.starts_at_rest and begins)
+        record = record_of(events, law, span, _GAP_S)
+        count = count or max(len(times_s), round((span[1] - span[0]) / _FILM_STEP_S) + 1)
+        seen = self.path(size, frames=False), still, record, law, np.linspace(*span, count)
+        from threadpoolctl import threadpool_limits  # whose import changes the environment
+
+        with threadpool_limits(1):
+            return estimate_event_film(*seen, frames=beside, prior=prior, modes=self._modes, progress=progress)
+
+
+class RunningFilm:
+    """The newest image of a film, of what cameras saw in the newest seconds, while they go on.
+
+    The frames' prior is sought again whenever twice as many frames have come as when it was sought.
+
+    Args:
+        solver: What makes the film.
+        evidence: What it is made of.
+        newest_s: How much of the past an image knows, seconds: what bounds the time it takes.
+
+    Raises:
+        ConfigError: The seconds are too few for three images, or not finite.
+    """
+
+    def __init__(
+        self, solver: FilmSolver, evidence: Literal["frames", "events", "both"], newest_s: float
+    ) -> None:
+        if not 3 * _FILM_STEP_S <= newest_s < math.inf:
+            raise ConfigError(f"newest_s is {newest_s:g}; give {3 * _FILM_STEP_S:g} seconds or more")
+        self._solver, self._evidence, self._newest_us = solver, evidence, round(1e6 * newest_s)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what comes next is of another recording."""
+        self._events, self._frames = list[Events](), list[tuple[int, NDArray[np.float32]]]()
+        self._begin_us: int | None = None
+        self._until_us, self._count, self._sought = 0, 0, 0
+        self._prior: FilmPrior | None = None
+
+    def add(
+        self, events: Events, until_us: int, frame: NDArray | None = None, frame_us: int | None = None
+    ) -> None:
+        """Take what came next.
+
+        Args:
+            events: Events, in order.
+            until_us: Instant up to which they are complete, microseconds.
+            frame: White levels [H, W], less the camera's fixed pattern; None where none came.
+            frame_us: When the frame was taken, microseconds; None: at `until_us`.
+        """
+        if self._begin_us is None:
+            self._begin_us = min(until_us, int(events.t_us[0]) - 1) if len(events) else until_us
+        self._until_us = until_us
+        self._events += [events] if len(events) and self._evidence != "frames" else []
+        if frame is not None and self._evidence != "events":
+            self._frames.append((until_us if frame_us is None else frame_us, frame))
+            self._count += 1
+
+    def newest(self) -> tuple[NDArray[np.float32], int] | None:
+        """Return the newest image, float32 [h, w], and its instant, microseconds; None: too little came."""
+        seen = self._events if self._evidence == "events" else self._frames[LEAST_FRAMES - 1 :]
+        end_us = self._frames[-1][0] if self._frames else self._until_us
+        begin_us = self._begin_us or 0
+        first_us = max(begin_us, end_us - self._newest_us)
+        if not seen or end_us - first_us < 1e6 * _FILM_STEP_S:
+            return None
+        times_us, frames, events = np.linspace(first_us, end_us, LEAST_FRAMES), None, None
+        if self._evidence != "events":
+            recent = sum(t_us >= first_us for t_us, _ in self._frames)
+            self._frames = self._frames[-max(recent, LEAST_FRAMES) :]
+            times, images = zip(*self._frames, strict=True)
+            times_us, frames = np.array(times), np.stack(images)
+        if self._events:
+            events = Events.concatenate(self._events).between(int(times_us[0]), self._until_us)
+            self._events = [events]
+        is_old = self._count < 2 * self._sought
+        found = self._solver.film(
+            times_us * 1e-6,
+            frames,
+            events,
+            prior=self._prior if is_old else None,
+            begins=int(times_us[0]) <= begin_us,
+            count=max(LEAST_FRAMES, round((times_us[-1] - times_us[0]) * 1e-6 / _FILM_STEP_S) + 1),
+        )
+        if frames is not None and not is_old:
+            self._prior, self._sought = found.prior, self._count
+        return found.mean[-1].astype(np.float32), int(end_us)
+
+
 def estimate_film_of(
     capture: Capture,
     setup: Setup,
@@ -416,31 +589,12 @@ def estimate_film_of(
         ConfigError: The event model states no law of its crossings.
         DataError: Too few frames, or too many images.
     """
-    times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
-    frames, found = None, None
-    if evidence != "events":
-        height, width = capture.frames.shape[1:]
-        across = min(columns, width)
-        shape = (max(1, round(height * across / width)), across)
-        light = object_light(capture.frames, capture.peak, setup, shape, pattern).double()
-        level = light.mean(dim=0) + setup.ambient_light(shape)
-        averaged = height * width / (shape[0] * shape[1])  # of the sensor's pixels, each with its own noise
-        noise = (setup.frame_camera.noise_variance(level) / averaged).sqrt()
-        operator = setup.seen_by((height, width)).operator(plane, shape)
-        found = estimate_film(operator, light, times, noise, static=static)
-        if evidence == "frames":
-            return found
-        frames = FilmFrames(operator, light, noise, found)
-    size = (capture.events.height, capture.events.width)
-    seen, span = setup.seen_by(size), (float(times[0]), float(times[-1]))
-    still = seen.ambient_light(size)
-    law = setup.pixel.known_law(WHITE_DN * float(still.mean()))
-    record = record_of(capture.events, law, span, _GAP_S)
-    count = max(len(times), round((span[1] - span[0]) / _FILM_STEP_S) + 1)
-    nodes = np.linspace(*span, count)
-    from threadpoolctl import threadpool_limits  # whose import changes the environment
-
-    with threadpool_limits(1):
-        return estimate_event_film(
-            seen.operator(plane, size), still, record, law, nodes, frames=frames, progress=progress
-        )
+    return FilmSolver(setup, plane, columns).film(
+        np.asarray(capture.frame_times_us * 1e-6, np.float64),
+        None if evidence == "events" else capture.frames,
+        None if evidence == "frames" else capture.events,
+        peak=capture.peak,
+        pattern=pattern,
+        static=static,
+        progress=progress,
+    )
