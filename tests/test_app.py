@@ -29,6 +29,7 @@ from evnlos import Events, machine, untrusted
 from evnlos.analysis.identify import GUESSED
 from evnlos.app.controls import (
     CHARACTERS,
+    FILMS,
     INK_SIDE,
     PRESETS,
     Controls,
@@ -36,6 +37,7 @@ from evnlos.app.controls import (
     link_of,
     picked,
     settings_of,
+    simulate_film,
     simulate_sequence,
 )
 from evnlos.app.page import Wanted, build_page, simulated
@@ -43,8 +45,10 @@ from evnlos.app.serve import Server, middleware, running
 from evnlos.app.views import (
     Networks,
     event_views,
+    film_truth,
     found_views,
     from_each_frame,
+    from_film,
     from_weights,
     from_whole_sequence,
     limits_of,
@@ -103,6 +107,39 @@ def test_a_drawing_is_a_target() -> None:
     with pytest.raises(ConfigError, match="hidden character"):
         picked("RR")
     assert picked(CHARACTERS[0]).mask.any()
+
+
+def test_a_plane_that_changes_is_a_film() -> None:
+    polished = replace(SMALL, roughness=0.02)
+    for name in FILMS:
+        recorded = simulate_film(polished, name)
+        assert len(recorded) == 40 and len(recorded.events) > 100 and recorded.truth(Sampling()) is None
+        again = simulate_film(polished, name)
+        assert again.events == recorded.events and again.frames.tobytes() == recorded.frames.tobytes()
+        truth, found = film_truth(recorded), from_film(recorded, "frames")
+        assert found.images.shape == truth.shape == (40, 16, 16) and found.psnr_db.shape == (40,)
+        assert found.psnr_db.mean() > found.black_db.mean() + 4
+        changes, true = (one - one.mean(axis=0) for one in (found.images, truth))
+        assert np.corrcoef(changes.ravel(), true.ravel())[0, 1] > 0.7
+    for evidence in ("events", "both"):
+        seen = from_film(recorded, evidence)
+        assert seen.images.shape == truth.shape and "90 % intervals hold" in seen.note
+        assert seen.psnr_db.mean() > seen.black_db.mean()
+    with pytest.raises(ConfigError, match="hidden film is 'R'; give closing hand or screen that fades"):
+        simulate_film(SMALL, "R")
+    with pytest.raises(DataError, match="setup"):
+        from_film(replace(recorded, simulation=None), "frames")
+
+
+def test_a_film_stands_on_the_page_beside_the_truth() -> None:
+    first, between, second = simulated(SMALL, "closing hand", Networks())
+    assert between == (second[0], first[1])
+    for title in (">Hidden plane<", ">Wall<", ">Events<", ">Film, frames<", ">Space-time cloud<"):
+        assert title in first[0] and title in second[0]
+    for title in (">Film, events<", ">Film, both<"):
+        assert title not in first[0] and title in second[0]
+    assert 'aria-label="Image of the film"' in first[0] and "image 21 of 40" in first[0]
+    assert "Network" not in second[0] and "dB, black" in second[0]
 
 
 def test_classical_images_beat_black_and_the_whole_sequence_beats_one_frame(app_sequence) -> None:
@@ -210,12 +247,15 @@ def test_the_page_leaves_out_what_comes_of_a_removed_upload(tmp_path, monkeypatc
     page, visitor = built_page(gradio, tmp_path), SimpleNamespace(session_hash="one")
     (file,) = [one for one in page.blocks.values() if isinstance(one, gradio.File)]
     begin, read = [one.fn for one in page.fns.values() if file in one.inputs]
-    begin("a.raw", visitor)
-    assert read("a.raw", visitor) == ("sheet of a.raw", "message")
+    how = "moves as a whole", 20, 14, visitor
+    begin("a.raw", *how)
+    assert read("a.raw", *how) == ("sheet of a.raw", "message")
     for then in (None, "b.raw"):
-        assert begin(then, visitor)[0] == ""
-        assert "sheet" not in str(read("a.raw", visitor))
-    assert read("b.raw", visitor)[0] == "sheet of b.raw"
+        assert begin(then, *how)[0] == ""
+        assert "sheet" not in str(read("a.raw", *how))
+    assert read("b.raw", *how)[0] == "sheet of b.raw"
+    begin("b.raw", "rests and changes its picture", 20, 14, visitor)
+    assert "sheet" not in str(read("b.raw", *how))
 
 
 def test_what_comes_of_a_removed_upload_is_not_shown() -> None:
@@ -626,11 +666,15 @@ def test_a_link_says_the_settings_and_no_more() -> None:
     assert settings_of(query, Controls(columns=64)) == (replace(changed, columns=64), "Q", "")
     assert settings_of({"ink": "ff", "theme": "dark"}, Controls()) == (Controls(), "R", "ff")
     assert link_of(Controls(), ink="00") == "?ink=00"
+    shown = link_of(Controls(), "closing hand")
+    assert shown == "?film=closing+hand"
+    assert settings_of(dict(parse_qsl(shown[1:])), Controls()) == (Controls(), "closing hand", "")
     for wrong in (
         {"roughness": "9"},
         {"roughness": "nan"},
         {"wall": "glass"},
         {"character": "??"},
+        {"film": "R"},
         {"ambient": "x"},
     ):
         with pytest.raises(ConfigError):
@@ -663,6 +707,11 @@ def test_drawings_and_uploads_in_a_real_browser(zipped_capture, tmp_path) -> Non
         before = browser.run(f"return {SEQUENCE_OF}")
         browser.drag([(int(x) + 40, int(y) + 40), (int(x) + 150, int(y) + 150)])
         browser.wait(f"return {SEQUENCE_OF} !== {json.dumps(before)}")
+        # So does a plane that changes.
+        browser.run("document.querySelector('input[type=radio][value=\"One that changes\"]').click()")
+        label = "document.querySelector('.ev-position').getAttribute('aria-label')"
+        browser.wait(f"return {label} === 'Image of the film' && {SEQUENCE_OF}.length")
+        browser.wait("return document.querySelector('[aria-label*=\"What changes\"]')?.offsetWidth")
         # An upload is shown; one that is too large is refused.
         asked += browser.requests()
         browser.run(

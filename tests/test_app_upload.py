@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from evnlos.app.page import uploaded
 from evnlos.app.upload import MOST_FILES, read_upload, read_upload_apart, unpack_zip
@@ -123,6 +124,27 @@ def test_a_capture_is_shown_and_reconstructed_and_nothing_stays(zipped_capture, 
     still = replace(found, motion=None)
     assert not Networks().of(still) and list(Networks().of(replace(found, frames=None))) == ["network, events"]
     assert list(scratch.iterdir()) == []
+
+
+def test_what_rests_and_changes_is_shown_as_a_film(zipped_capture, app_sequence, tmp_path) -> None:
+    given = str(zipped_capture), tmp_path, 10 * MB, Networks()
+    pictures, message = uploaded(*given, rests=True, sides_m=(0.2, 0.1))
+    assert ">Film, frames<" in pictures and ">Network" not in pictures
+    assert "film of a plane of 20 cm x 10 cm" in message and "ev-note" in message
+    unstated = tmp_path / "unstated.zip"
+    with zipfile.ZipFile(zipped_capture) as whole, zipfile.ZipFile(unstated, "w") as made:
+        for name in whole.namelist():
+            content = whole.read(name)
+            if name.endswith("capture.yaml"):
+                about = yaml.safe_load(content)
+                del about["motion"]
+                content = yaml.safe_dump(about).encode()
+            made.writestr(name, content)
+    assert ">Film, frames<" in uploaded(str(unstated), *given[1:])[0]
+    message = uploaded(str(unstated), *given[1:], sides_m=(0.0, 0.1))[1]
+    assert "0 x 0.1 m of 16 cells; give sides above 0" in message and 'role="alert"' in message
+    write_events(tmp_path / "walk.raw", app_sequence.events)
+    assert "without frames there is no film" in uploaded(str(tmp_path / "walk.raw"), *given[1:], rests=True)[1]
 
 
 @pytest.mark.parametrize("suffix", [".raw", ".npz", ".csv", ".h5"])

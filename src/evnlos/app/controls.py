@@ -1,14 +1,14 @@
 """What a visitor chooses: controls, the hidden object, and the sequence that the cameras saw.
 
 - What the page lets a visitor choose, as settings of a small simulation.
-- The hidden object: a character picked, or a visitor's drawing.
+- The hidden object: a character picked, a visitor's drawing, or a plane that changes.
 - One sequence as the cameras saw it, whether it was simulated a moment ago or uploaded.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Literal
@@ -22,10 +22,23 @@ from evnlos.data import Samples, Sampling, Simulation, make_samples
 from evnlos.data.sampling import edges_from
 from evnlos.data.simulations import page
 from evnlos.errors import ConfigError, DataError
-from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, HandwritingGlyphs, Motion, Scene, Target
+from evnlos.inverse.sequence_problem import matrix_of
+from evnlos.optics import FilmWall, MatrixTransport
+from evnlos.scene import (
+    DIGITS,
+    TRAIN_WRITERS,
+    UPPER_CASE,
+    Film,
+    HandwritingGlyphs,
+    Motion,
+    Scene,
+    Target,
+    closing_hand,
+    drawing,
+)
 from evnlos.scene.glyph_sets import TargetPlane
 from evnlos.setups import RadiometricSetup, SensorSize
-from evnlos.types import Events, derive_seed
+from evnlos.types import Events, Irradiance, Plane, derive_seed
 
 _PAGE = page()  # what the package's networks learned from: setup and samples here are the same
 POSITIONS = _PAGE.positions
@@ -150,21 +163,23 @@ _LINKED = ("wall", *(name for name in Controls.__dataclass_fields__ if name not 
 
 
 def link_of(controls: Controls, character: str = "", ink: str = "") -> str:
-    """Return the query of an address that opens the page with these settings.
+    """Return the query of an address that opens the page with these settings; a film is a character here.
 
     Example:
         >>> link_of(Controls(roughness=0.02), "G")
         '?character=G&roughness=0.02'
     """
     usual = Controls()
-    query: dict[str, object] = {"ink": ink} if ink else {"character": character}
+    query: dict[str, object] = (
+        {"ink": ink} if ink else {"film" if character in FILMS else "character": character}
+    )
     query |= {name: getattr(controls, name) for name in _LINKED}
     changed = {name: value for name, value in query.items() if value != getattr(usual, name, None)}
     return "?" + urlencode(changed)
 
 
 def settings_of(query: Mapping[str, str], opening: Controls) -> tuple[Controls, str, str]:
-    """Return controls, character and drawing of an address that `link_of` made.
+    """Return controls, character or film, and drawing of an address that `link_of` made.
 
     Args:
         query: Names and values; names that are none of ours are left alone.
@@ -176,6 +191,9 @@ def settings_of(query: Mapping[str, str], opening: Controls) -> tuple[Controls, 
     character, ink = query.get("character", "R"), query.get("ink", "")
     if character not in CHARACTERS or len(character) != 1 or len(ink) > 2 * INK_SIDE**2:
         raise ConfigError(f"character is {character[:20]!r}; give one of {CHARACTERS}")
+    film = query.get("film", "")
+    if film and film not in FILMS:
+        raise ConfigError(f"film is {film[:20]!r}; give {' or '.join(FILMS)}")
     given: dict[str, Any] = {}
     for name in _LINKED:
         if name in query:
@@ -183,7 +201,7 @@ def settings_of(query: Mapping[str, str], opening: Controls) -> tuple[Controls, 
                 given[name] = query[name] if name == "wall" else float(query[name])
             except ValueError:
                 raise ConfigError(f"{name} is {query[name][:20]!r}; give a number") from None
-    return replace(opening, **given), character, ink
+    return replace(opening, **given), film or character, ink
 
 
 CHARACTERS = UPPER_CASE + DIGITS
@@ -236,6 +254,41 @@ def drawn(ink: str, size_m: float = 0.08) -> Target:
     return Target("drawing", mask, size_m)
 
 
+FILM_PLANE = Plane(16, 16, 0.005)
+"""The hidden plane that changes, in cells of a reconstruction: 8 cm, as a target."""
+_FINE = Plane(2 * FILM_PLANE.height, 2 * FILM_PLANE.width, FILM_PLANE.pitch_m / 2)  # cells of the simulation
+
+
+def _hand() -> Film:
+    """Return a hand that closes and opens twice."""
+    shapes = [closing_hand(closed, _FINE.width) for closed in np.linspace(0, 1, 17)]
+    once = [*shapes, *shapes[-2::-1]]
+    images = [*once, *once[1:]]
+    return Film(np.stack(images), np.linspace(0, 1, len(images)))
+
+
+def _screen() -> Film:
+    """Return a screen that shows four pictures, each fading into the next."""
+    pictures = [drawing(kind, 0, 0, _FINE.width) for kind in ("icon", "person", "vehicle", "doodle")]
+    return Film(
+        np.stack([one for one in pictures for _ in range(2)]), [0, 0.19, 0.27, 0.46, 0.54, 0.73, 0.81, 1]
+    )
+
+
+FILMS: dict[str, Callable[[], Film]] = {"closing hand": _hand, "screen that fades": _screen}
+"""Hidden planes that change, by name; a film lasts from 0 to 1."""
+
+
+@lru_cache(maxsize=8)
+def _shown(name: str) -> Film:
+    return FILMS[name]()
+
+
+@lru_cache(maxsize=16)
+def _film_path(setup: RadiometricSetup) -> MatrixTransport:
+    return matrix_of(setup.operator(_FINE))
+
+
 _TOLERANCE = 0.03  # thresholds: the eye sees no difference to the default, which takes longer
 
 
@@ -255,6 +308,7 @@ class Recorded:
         simulation: The setup, where it is known.
         distance_m: From hidden object to wall, metres, where it is noted.
         notes: What reading did, a line each.
+        film: What a hidden plane shows that changes; None of an object that moves, and where it is unknown.
     """
 
     name: str
@@ -267,6 +321,7 @@ class Recorded:
     simulation: Simulation | None = None
     distance_m: float | None = None
     notes: tuple[str, ...] = field(default=())
+    film: Film | None = None
 
     def __len__(self) -> int:
         return len(self.edges_us) - 1
@@ -303,12 +358,41 @@ def simulate_sequence(controls: Controls, target: Target) -> Recorded:
     """
     simulation = controls.simulation()
     scene = Scene(target, simulation.motion, simulation.duration_s)
-    wall = simulation.setup.observe(scene)
-    times_s = scene.position_times_s(simulation.positions)
+    wall, times_s = simulation.setup.observe(scene), scene.position_times_s(simulation.positions)
+    seen = _recorded(controls, simulation, wall, times_s, target.name)
+    return replace(seen, motion=scene.motion, target=target)
+
+
+def simulate_film(controls: Controls, name: str) -> Recorded:
+    """Simulate one sequence of a hidden plane that changes, once from beginning to end.
+
+    Args:
+        controls: Setup and camera; the speed says how long it takes, as of an object that moves.
+        name: One of `FILMS`.
+
+    Raises:
+        ConfigError: The setup is geometrically impossible, or the name is none.
+    """
+    if name not in FILMS:
+        raise ConfigError(f"the hidden film is {name[:20]!r}; give {' or '.join(FILMS)}")
+    simulation = controls.simulation()
+    setup, seconds = simulation.setup, simulation.duration_s
+    film = Film(_shown(name).images, seconds * np.asarray(_shown(name).times_s))
+    # No edge goes more than half the image in the quarter of the film in which a hand closes.
+    speed = 2 * setup.sensor.width / seconds
+    path = _film_path(replace(setup.optics(), sensor=setup.sensor))
+    wall = FilmWall(path, film, ambient=setup.ambient_light(), speed_px_s=speed)
+    times_s = np.arange(1, POSITIONS + 1) * seconds / POSITIONS
+    return replace(_recorded(controls, simulation, wall, times_s, name), film=film)
+
+
+def _recorded(
+    controls: Controls, simulation: Simulation, wall: Irradiance, times_s: NDArray[np.float64], name: str
+) -> Recorded:
+    """Return what the cameras record of a wall."""
     camera = simulation.frame_camera
     events = EventCamera(simulation.pixel, _TOLERANCE, simulation.setup.time_step_s).record(
         wall, 0.0, simulation.duration_s, seed=derive_seed(controls.seed, "events")
     )
     frames = camera.capture(wall, times_s, seed=derive_seed(controls.seed, "frames"))
-    edges_us = edges_from(times_s)
-    return Recorded(target.name, events, edges_us, frames, camera.white, scene.motion, target, simulation)
+    return Recorded(name, events, edges_from(times_s), frames, camera.white, simulation=simulation)

@@ -1,6 +1,6 @@
 """The page in Gradio: texts, controls, and what happens when a control moves.
 
-- The texts of the page that stand still: its head, and its words explained.
+- The texts of the page that stand still.
 - What happens when a control moves or a file arrives: images and words as HTML, piece by piece.
 - The page in Gradio: controls on the left, images on the right.
 """
@@ -16,6 +16,7 @@ from typing import Any
 
 from evnlos.app.controls import (
     CHARACTERS,
+    FILMS,
     INK_SIDE,
     PRESETS,
     Controls,
@@ -24,26 +25,31 @@ from evnlos.app.controls import (
     link_of,
     picked,
     settings_of,
+    simulate_film,
     simulate_sequence,
 )
 from evnlos.app.upload import read_upload_apart
 from evnlos.app.views import (
+    GLOSSARY,
     Networks,
     Reconstruction,
     View,
     event_views,
     found_views,
     from_each_frame,
+    from_film,
     from_weights,
     from_whole_sequence,
     limits_of,
     message_box,
+    nearest_setup,
     seen_views,
     sheet,
     verdict_box,
     waiting_box,
 )
 from evnlos.errors import EvnlosError
+from evnlos.inverse import film_plane
 from evnlos.plot.setup import setup_drawing
 from evnlos.scene import Target
 
@@ -58,28 +64,6 @@ aria-label="Drawing of the hidden object, 8 cm wide. Arrow keys move the pen, wi
 <small>8 cm x 8 cm. Draw with mouse or finger; arrow keys move the pen, with Shift they draw.</small></div>"""
 """The paper of a drawing; `page.js` draws on it."""
 
-_WORDS = {
-    "wall roughness": "How far the wall throws light off the direction in which a mirror would. At 0.02 it is "
-    "polished metal, at 0.1 it is dull; matte paint throws light everywhere alike.",
-    "white level": "A light of 1 white level just fills a pixel of the frame camera.",
-    "event": "A pixel of an event camera sends no images. It reports when its light has changed by a "
-    "threshold, brighter or darker, at that instant.",
-    "threshold": "How much the natural logarithm of a pixel's light has to change for an event: 0.15 is 16 %.",
-    "time surface": "An image made from events: each pixel shows how recent its newest event is.",
-    "least squares": "The image that explains one frame best, kept dark where the frame says nothing.",
-    "whole sequence": "The one image that explains all frames of the sequence together.",
-    "dB": "PSNR: ten decibels more are a tenth of the squared error. It means something only beside the value "
-    "of an all-black image at the same instant.",
-    "verdict": "What wall and noise leave to be seen in one frame, whatever the method; a whole sequence shows "
-    "more. Where they leave nothing, a network may still draw a letter: it remembers one.",
-}
-
-GLOSSARY = (
-    '<details class="ev-words"><summary>What the words mean</summary><dl>'
-    + "".join(f"<dt>{word}</dt><dd>{text}</dd>" for word, text in _WORDS.items())
-    + "</dl></details>"
-)
-
 
 UPLOADS_AT_ONCE = 4
 """Uploads that are read at the same time, each in a process of its own."""
@@ -87,23 +71,26 @@ _drawing = threading.Lock()  # what was read and checked takes seconds, and the 
 
 
 def simulated(
-    controls: Controls, target: Target, networks: Networks, link: str = ""
+    controls: Controls, hidden: Target | str, networks: Networks, link: str = ""
 ) -> Iterator[tuple[str, str]]:
-    """Yield (sheet, verdict) of a simulated sequence three times: without networks, with them, with the
-    verdict.
+    """Yield (sheet, verdict) of a simulated sequence three times: what is quick, all, and with the verdict.
 
     Args:
         controls: Setup and camera.
-        target: What is hidden.
+        hidden: The object that moves, or the name of a film: a plane that changes, of which no network knows.
         networks: The page's networks.
         link: Address of these settings.
 
     Raises:
         EvnlosError: The settings can't be.
     """
-    recorded = simulate_sequence(controls, target)
+    is_film = isinstance(hidden, str)
+    recorded = simulate_film(controls, hidden) if is_film else simulate_sequence(controls, hidden)
     before, after = seen_views(recorded), event_views(recorded)
-    found = [from_whole_sequence(recorded), from_each_frame(recorded)]
+    if is_film:
+        found = [from_film(recorded, "frames")]
+    else:
+        found = [from_whole_sequence(recorded), from_each_frame(recorded)]
     assert recorded.simulation is not None  # it was simulated
     drawing = setup_drawing(recorded.simulation.setup)
     about = (
@@ -111,8 +98,11 @@ def simulated(
         drawing.svg.replace(" xmlns='http://www.w3.org/2000/svg'", "") if drawing else "",
     )  # within HTML it has none
     yield _sheet(recorded, before, found, after, *about), waiting_box()
-    wall = networks.wall_of(recorded)
-    found += [from_weights(recorded, name, one, wall) for name, one in networks.of(recorded).items()]
+    if is_film:
+        found += [from_film(recorded, "events"), from_film(recorded, "both")]
+    else:
+        wall = networks.wall_of(recorded)
+        found += [from_weights(recorded, name, one, wall) for name, one in networks.of(recorded).items()]
     pictures = _sheet(recorded, before, found, after, *about)
     yield pictures, waiting_box()
     yield pictures, verdict_box(limits_of(recorded.simulation))
@@ -124,7 +114,7 @@ def opening_verdict(controls: Controls) -> str:
 
 
 class Wanted:
-    """Which upload each visitor looks at: what comes of a file that was removed meanwhile is not shown.
+    """Which upload each visitor looks at, and how: what comes of one that was removed meanwhile is not shown.
 
     Args:
         most: Visitors to remember; of others every result is shown.
@@ -145,7 +135,14 @@ class Wanted:
         return self._paths.get(visitor, path) == path
 
 
-def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networks) -> tuple[str, str]:
+def uploaded(
+    path: str | None,
+    scratch: Path,
+    limit_bytes: int,
+    networks: Networks,
+    rests: bool = False,
+    sides_m: tuple[float, float] = (0.2, 0.14),
+) -> tuple[str, str]:
     """Return (sheet, message) of an uploaded file; whatever is wrong with it is a message of one line.
 
     Args:
@@ -153,6 +150,9 @@ def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networ
         scratch: Folder to unpack in.
         limit_bytes: Largest file, bytes.
         networks: The page's networks.
+        rests: Whether nothing moves as a whole, by the visitor's word: a film is shown, as of frames whose
+            motion nobody states.
+        sides_m: Width and height of the plane that changes, metres.
     """
     if not path:
         return "", message_box(_NO_FILE, wrong=False)
@@ -160,7 +160,10 @@ def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networ
         recorded = read_upload_apart(path, scratch, limit_bytes)
         found, refused = [], []
         with _drawing:
-            known, wall = networks.of(recorded), networks.wall_of(recorded)
+            known, wall = {} if rests else networks.of(recorded), networks.wall_of(recorded)
+            setup = nearest_setup(recorded) if (rests or not known) and recorded.frames is not None else None
+            if setup is not None:
+                found.append(from_film(recorded, "frames", (setup, film_plane(sides_m, _CELLS))))
             for name, one in known.items():
                 try:
                     found.append(from_weights(recorded, name, one, wall))
@@ -170,7 +173,15 @@ def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networ
     except (EvnlosError, OSError, MemoryError) as error:
         return "", message_box(_without_folder(str(error) or "the file needs too much memory", path, scratch))
     notes = [*recorded.notes, *refused]
-    if not known:
+    if found and not known:
+        size = " x ".join(f"{100 * side:g} cm" for side in sides_m)
+        notes.append(
+            f"shown as the film of a plane of {size} that changes, with the published setup whose distance is "
+            "nearest; evnlos invert --changing takes your own setup"
+        )
+    elif rests:
+        notes.append("without frames there is no film here; see evnlos invert --changing --from events")
+    elif not known:
         notes.append(
             "no network to reconstruct with: those of the package need a capture folder that states the "
             "motion; or start the page with --weights"
@@ -182,7 +193,9 @@ def _sheet(
     recorded: Recorded, before: list[View], found: list[Reconstruction], after: list[View], *about: str
 ) -> str:
     views = [*before, *found_views(found), *after]
-    return sheet(views, recorded.times_s - recorded.edges_us[0] * 1e-6, recorded.name, *about)
+    moment = ("position", "hidden object") if recorded.film is None else ("image", "film")
+    times_s = recorded.times_s - recorded.edges_us[0] * 1e-6
+    return sheet(views, times_s, recorded.name, *about, moment=moment)
 
 
 def _without_folder(text: str, path: str, scratch: Path) -> str:
@@ -194,7 +207,11 @@ def _without_folder(text: str, path: str, scratch: Path) -> str:
 
 
 _NO_FILE = "no file yet: choose a recording, or a capture folder as a zip"
-_PICK, _DRAW = "Pick a character", "Draw one"
+_PICK, _DRAW, _CHANGE = "Pick a character", "Draw one", "One that changes"
+_MOVES, _RESTS = "moves as a whole", "rests and changes its picture"
+_CELLS = 16  # along the longer side of an uploaded film
+_BEFORE = 4  # controls of what is hidden
+_SPEED = "One that changes takes as long as an object of this speed for its 16 cm."
 _METAL, _MATTE = "rough metal", "matte white paint"
 _FONT = ("system-ui", "sans-serif")
 
@@ -228,6 +245,10 @@ def build_page(
                 f"at most {limit / 1e6:g} MB. It stays on the machine that runs this page, in a folder that is "
                 "deleted when the page is stopped."
             )
+            with gr.Row():
+                rests = gr.Radio([_MOVES, _RESTS], value=_MOVES, label="The hidden object")
+                wide = gr.Number(20, label="Width of a plane that changes, cm")
+                high = gr.Number(14, label="Height of a plane that changes, cm")
             file = gr.File(label="Recording, or zip of a capture folder", file_count="single", type="filepath")
             message = gr.HTML()
             shown = gr.HTML()
@@ -236,32 +257,29 @@ def build_page(
         quiet: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         for control in controls:
             control.change(run, controls, [pictures, verdict], trigger_mode="always_last", **quiet)
-        preset.input(lambda name: _values(replace(opening, **PRESETS[name])), preset, controls[3:], **quiet)
+        preset.input(
+            lambda name: _values(replace(opening, **PRESETS[name])), preset, controls[_BEFORE:], **quiet
+        )
         # The page opens with a sequence that is there already; only its verdict may still be on its way.
         page.load(_open_link(gr, opening), None, [*controls, verdict], **quiet)
         wanted = Wanted()
 
-        def begin(path: str | None, request: Any) -> tuple[str, str]:
-            wanted.note(request.session_hash, path)
+        def begin(path: str | None, how: str, wide: float | None, high: float | None, request: Any) -> Any:
+            wanted.note(request.session_hash, repr([path, how, wide, high]))
             return "", message_box("reading ..." if path else _NO_FILE, wrong=False)
 
-        def read(path: str | None, request: Any) -> tuple[Any, Any]:
-            found = uploaded(path, scratch, limit, networks)
-            return found if wanted.is_still(request.session_hash, path) else (gr.skip(), gr.skip())
+        def read(path: str | None, how: str, wide: float | None, high: float | None, request: Any) -> Any:
+            what, sides_m = repr([path, how, wide, high]), ((wide or 0) / 100, (high or 0) / 100)
+            found = uploaded(path, scratch, limit, networks, how == _RESTS, sides_m)
+            return found if wanted.is_still(request.session_hash, what) else (gr.skip(), gr.skip())
 
         for step in (begin, read):
             step.__annotations__["request"] = gr.Request  # Gradio hands it to who names it
-        file.change(begin, file, [shown, message], queue=False, trigger_mode="multiple", **quiet)
-        file.change(
-            read,
-            file,
-            [shown, message],
-            trigger_mode="multiple",
-            show_progress="minimal",
-            show_progress_on=message,
-            api_visibility="private",
-            concurrency_limit=UPLOADS_AT_ONCE,
-        )
+        given = [file, rests, wide, high]
+        when: dict[str, Any] = {"triggers": [one.change for one in given], "trigger_mode": "multiple"}
+        gr.on(fn=begin, inputs=given, outputs=[shown, message], queue=False, **when, **quiet)
+        slow = {"show_progress": "minimal", "show_progress_on": message, "concurrency_limit": UPLOADS_AT_ONCE}
+        gr.on(fn=read, inputs=given, outputs=[shown, message], **when, **(quiet | slow))
     return page
 
 
@@ -282,15 +300,18 @@ def _controls(gr: Any, opening: Controls) -> list[Any]:
         return made
 
     with gr.Group():
-        how = gr.Radio([_PICK, _DRAW], value=_PICK, label="Hidden object")
+        how = gr.Radio([_PICK, _DRAW, _CHANGE], value=_PICK, label="Hidden object")
         character = gr.Dropdown(list(CHARACTERS), value="R", label="Character, on a target plane of 8 cm")
+        film = gr.Dropdown(
+            list(FILMS), value=next(iter(FILMS)), visible=False, label="What changes, on a target plane of 8 cm"
+        )
         ink = gr.Textbox(elem_id="ev-ink", visible="hidden", max_length=2 * INK_SIDE**2)
         with gr.Column(visible=False) as paper:
             gr.HTML(PAPER, padding=True)
     how.change(
-        lambda chosen: (gr.update(visible=chosen == _PICK), gr.update(visible=chosen == _DRAW)),
+        lambda chosen: [gr.update(visible=chosen == one) for one in (_PICK, _DRAW, _CHANGE)],
         how,
-        [character, paper],
+        [character, paper, film],
         show_progress="hidden",
         api_visibility="private",
     )
@@ -298,14 +319,14 @@ def _controls(gr: Any, opening: Controls) -> list[Any]:
         wall = gr.Radio([_METAL, _MATTE], value=_METAL, label="Wall")
         rough = slider(0.01, 0.3, opening.roughness, 0.01, "Wall roughness (metal)")
         distance = slider(15, 60, 100 * opening.distance_m, 1, "Distance from object to wall, cm")
-        speed = slider(0.5, 20, 100 * opening.speed_m_s, 0.5, "Speed of the object, cm/s")
+        speed = slider(0.5, 20, 100 * opening.speed_m_s, 0.5, "Speed of the object, cm/s", _SPEED)
         ambient = slider(0, 0.7, opening.ambient, 0.01, "Ambient light, white levels")
     with gr.Accordion("Cameras", open=True):
         noise = slider(0.2, 10, opening.frame_noise, 0.1, "Frame noise, times the usual camera's")
         on = slider(0.03, 0.6, opening.threshold_on, 0.01, "Threshold of brighter events, log light")
         off = slider(0.03, 0.6, opening.threshold_off, 0.01, "Threshold of darker events, log light")
         event_noise = slider(0, 2, opening.event_noise_hz, 0.01, "Event noise, events per pixel per second")
-    return [how, character, ink, wall, rough, distance, speed, ambient, noise, on, off, event_noise]
+    return [how, character, film, ink, wall, rough, distance, speed, ambient, noise, on, off, event_noise]
 
 
 def _values(controls: Controls) -> list[Any]:
@@ -317,15 +338,19 @@ def _values(controls: Controls) -> list[Any]:
 
 
 def _open_link(gr: Any, opening: Controls) -> Callable[[Any], list[Any]]:
+    untouched = [gr.skip()] * (_BEFORE + len(_values(opening)))
+
     def load(request: Any) -> list[Any]:
         query = dict(request.query_params)
         try:
             controls, character, ink = settings_of(query, opening)
         except EvnlosError as error:
-            return [gr.skip()] * 12 + [message_box(f"the link cannot be opened: {error}")]
+            return [*untouched, message_box(f"the link cannot be opened: {error}")]
         if (controls, character, ink) == (opening, "R", ""):
-            return [gr.skip()] * 12 + [opening_verdict(opening)]
-        return [_DRAW if ink else _PICK, character, ink, *_values(controls), gr.skip()]
+            return [*untouched, opening_verdict(opening)]
+        how = _DRAW if ink else _CHANGE if character in FILMS else _PICK
+        hidden = [gr.skip(), character] if character in FILMS else [character, gr.skip()]
+        return [how, *hidden, ink, *_values(controls), gr.skip()]
 
     load.__annotations__["request"] = gr.Request  # Gradio hands it to who names it
     return load
@@ -335,6 +360,7 @@ def _on_controls(gr: Any, opening: Controls, networks: Networks) -> Callable[...
     def run(
         how: str,
         character: str,
+        film: str,
         ink: str,
         wall: str,
         rough: float,
@@ -360,9 +386,9 @@ def _on_controls(gr: Any, opening: Controls, networks: Networks) -> Callable[...
                 opening.columns,
                 opening.seed,
             )
-            target = drawn(ink) if how == _DRAW else picked(character)
-            link = link_of(chosen, character, ink if how == _DRAW else "")
-            yield from simulated(chosen, target, networks, link)
+            hidden = drawn(ink) if how == _DRAW else film if how == _CHANGE else picked(character)
+            link = link_of(chosen, film if how == _CHANGE else character, ink if how == _DRAW else "")
+            yield from simulated(chosen, hidden, networks, link)
         except EvnlosError as error:
             yield gr.skip(), message_box(str(error))
 

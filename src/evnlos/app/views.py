@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from PIL import Image
 from evnlos.analysis import Identification, identify, reconstruct
 from evnlos.analysis.confidence import confidence_of, consistent, why_no_confidence
 from evnlos.analysis.identify import QUICK, verdict_on
-from evnlos.app.controls import COARSE, Recorded
+from evnlos.app.controls import COARSE, FILM_PLANE, Recorded
 from evnlos.cameras import EventPixel
 from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation, as_modality, object_light
 from evnlos.errors import DataError
@@ -34,7 +35,15 @@ from evnlos.events import time_surface
 from evnlos.events.volume import WORDS
 from evnlos.inverse import SequenceOperator, SequenceProblem
 from evnlos.metrics import psnr
-from evnlos.models import FrameOperator, Weights, load_weights, published, published_for, published_setup
+from evnlos.models import (
+    FilmSolver,
+    FrameOperator,
+    Weights,
+    load_weights,
+    published,
+    published_for,
+    published_setup,
+)
 from evnlos.optics import MatrixTransport
 from evnlos.plot.figures import (
     CloudSize,
@@ -90,9 +99,15 @@ class Networks:
         """
         setup = None if recorded.simulation is None else recorded.simulation.setup
         if setup is None and not self.own and recorded.motion is not None:
-            known = published_setup(published_for(recorded.distance_m, "frame", is_motion_known=True))
-            setup = load_setup(known) if known else None
+            setup = nearest_setup(recorded)
         return None if setup is None or recorded.frames is None else cache(partial(FrameOperator, setup))
+
+
+def nearest_setup(recorded: Recorded) -> Setup | None:
+    """Return the published setup whose distance is nearest to that of a recording; None where there is none."""
+    name = published_for(recorded.distance_m, "frame", is_motion_known=True) if published() else ""
+    known = published_setup(name)
+    return load_setup(known) if known else None
 
 
 @cache
@@ -114,6 +129,8 @@ def own_networks(paths: Iterable[Path]) -> Networks:
     return Networks(found)
 
 
+_FILM_MODES = 24  # of a film that events tell: more take seconds and show no more through this camera
+_MOST_IMAGES = 120  # of a film
 _DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far an image may go from it
 _CELLS = 16  # a side of the target plane of the whole sequence
 _SMOOTH = 3.0  # weight of the gradient in units of the noise's variance
@@ -183,6 +200,51 @@ def from_whole_sequence(recorded: Recorded) -> Reconstruction:
     )
 
 
+@lru_cache(maxsize=4)
+def _film_solver(setup: Setup, plane: Plane) -> FilmSolver:
+    return FilmSolver(setup, plane, modes=_FILM_MODES)
+
+
+def from_film(
+    recorded: Recorded,
+    evidence: Literal["frames", "events", "both"],
+    taken: tuple[Setup, Plane] | None = None,
+) -> Reconstruction:
+    """Return the film of a hidden plane that changes, from one in so many positions where there are very many.
+
+    Args:
+        recorded: The sequence.
+        evidence: What the film is made of.
+        taken: Setup and plane that the sequence is taken to be of; None: those of a simulated one.
+
+    Raises:
+        DataError: The setup is unknown, or the sequence has no frames or too few.
+    """
+    setup, plane = taken or (_known(recorded)[0], FILM_PLANE)
+    step = -(-len(recorded) // _MOST_IMAGES)
+    frames = None if evidence == "events" or recorded.frames is None else recorded.frames[::step]
+    events, times_s = None if evidence == "frames" else recorded.events, recorded.times_s[::step]
+    found = _film_solver(setup, plane).film(times_s, frames, events, peak=recorded.peak, count=len(times_s))
+    images = np.repeat(found.mean.astype(np.float32), step, axis=0)[: len(recorded)]
+    seen = {"frames": "frames", "events": "events", "both": "frames and events"}[evidence]
+    note = f"{'all' if step == 1 else f'one in {step}'} {seen}, nothing learned"
+    truth = film_truth(recorded)
+    if truth is not None:
+        low, high = found.interval()
+        note += f"; 90 % intervals hold {100 * np.mean((truth >= low) & (truth <= high)):.0f} % of the cells"
+    if not found.is_explained:
+        note += "; no plane here explains the frames: give a larger one, or the setup is another"
+    return _against(f"film, {evidence}", note, images, truth)
+
+
+def film_truth(recorded: Recorded) -> NDArray[np.float32] | None:
+    """Return what a plane that changes shows at each instant, on its cells, [N, h, w]; None where unknown."""
+    if recorded.film is None:
+        return None
+    fine, (rows, columns) = recorded.film.at(recorded.times_s), FILM_PLANE.shape
+    return fine.reshape(len(fine), rows, -1, columns, fine.shape[2] // columns).mean(axis=(2, 4))
+
+
 def from_weights(
     recorded: Recorded,
     name: str,
@@ -230,12 +292,19 @@ def _known(recorded: Recorded) -> tuple[Setup, NDArray]:
 def _scored(
     name: str, note: str, images: NDArray[np.float32], recorded: Recorded, sampling: Sampling
 ) -> Reconstruction:
-    truth = recorded.truth(sampling)
+    return _against(name, note, images, recorded.truth(sampling))
+
+
+def _against(
+    name: str, note: str, images: NDArray[np.float32], truth: NDArray[np.float32] | None
+) -> Reconstruction:
+    """Return images with their PSNR, those of a film within 0 and 1."""
     if truth is None:
         return Reconstruction(name, note, images)
     true = torch.from_numpy(truth)
     own, black = (
-        psnr(one, true).double().numpy() for one in (torch.from_numpy(images), torch.zeros_like(true))
+        psnr(one, true).double().numpy()
+        for one in (torch.from_numpy(images).clamp(0, 1), torch.zeros_like(true))
     )
     return Reconstruction(name, note, images, own, black)
 
@@ -290,6 +359,9 @@ def seen_views(recorded: Recorded) -> list[View]:
     truth = recorded.truth(Sampling())
     if truth is not None:
         views.append(View("Hidden object", "the truth, 24 cm x 12 cm; no camera sees it", grey(truth)))
+    if recorded.film is not None:
+        shown = grey(recorded.film.at(recorded.times_s))
+        views.append(View("Hidden plane", "the truth, 8 cm x 8 cm; no camera sees it", shown))
     if recorded.frames is not None:
         views.append(_wall_view(recorded))
     events, edges = smaller(recorded.events, _LONGEST_SIDE), recorded.edges_us
@@ -368,6 +440,32 @@ def _wall_view(recorded: Recorded) -> View:
     )
 
 
+_WORDS = {
+    "wall roughness": "How far the wall throws light off the direction in which a mirror would. At 0.02 it is "
+    "polished metal, at 0.1 it is dull; matte paint throws light everywhere alike.",
+    "white level": "A light of 1 white level just fills a pixel of the frame camera.",
+    "event": "A pixel of an event camera sends no images. It reports when its light has changed by a "
+    "threshold, brighter or darker, at that instant.",
+    "threshold": "How much the natural logarithm of a pixel's light has to change for an event: 0.15 is 16 %.",
+    "time surface": "An image made from events: each pixel shows how recent its newest event is.",
+    "least squares": "The image that explains one frame best, kept dark where the frame says nothing.",
+    "film": "An image for each instant of a plane that changes: nothing moves as a whole. Images close in time "
+    "are alike; how much, the frames tell.",
+    "whole sequence": "The one image that explains all frames of the sequence together.",
+    "dB": "PSNR: ten decibels more are a tenth of the squared error. It means something only beside the value "
+    "of an all-black image at the same instant.",
+    "verdict": "What wall and noise leave to be seen in one frame, whatever the method; a whole sequence shows "
+    "more. Where they leave nothing, a network may still draw a letter: it remembers one.",
+}
+
+GLOSSARY = (
+    '<details class="ev-words"><summary>What the words mean</summary><dl>'
+    + "".join(f"<dt>{word}</dt><dd>{text}</dd>" for word, text in _WORDS.items())
+    + "</dl></details>"
+)
+"""The words explained, as HTML."""
+
+
 _GROUPS = {
     "seen": "What is there, and what the cameras see",
     "found": "What can be made of it",
@@ -381,6 +479,7 @@ def sheet(
     name: str = "sequence",
     link: str = "",
     drawing: str = "",
+    moment: tuple[str, str] = ("position", "hidden object"),
 ) -> str:
     """Return views in their groups, above them a slider over the positions and a button that plays them.
 
@@ -392,17 +491,19 @@ def sheet(
         name: What the sequence is called, for people who listen to the page.
         link: Address of these settings, or nothing.
         drawing: The setup from above as SVG, or nothing.
+        moment: What the slider runs over, and of what.
     """
     count = len(times_s)
     start = count // 2
-    words = [f"position {k + 1} of {count}, {time:.2f} s" for k, time in enumerate(times_s)]
+    words = [f"{moment[0]} {k + 1} of {count}, {time:.2f} s" for k, time in enumerate(times_s)]
     texts = html.escape(json.dumps(words), True)
     parts = [
         '<div class="ev-player">',
         '<button type="button" class="ev-button ev-play" aria-pressed="false" onclick="evnlosPlay(this)">'
         "Play</button>",
-        f'<label>Position <input type="range" class="ev-position" min="0" max="{count - 1}" step="1" '
-        f'value="{start}" aria-label="Position of the hidden object" oninput="evnlosMove(this)"></label>',
+        f'<label>{moment[0].capitalize()} <input type="range" class="ev-position" min="0" max="{count - 1}" '
+        f'step="1" value="{start}" aria-label="{moment[0].capitalize()} of the {moment[1]}" '
+        'oninput="evnlosMove(this)"></label>',
         f'<output class="ev-now" data-texts="{texts}">{words[start]}</output>',
         '<button type="button" class="ev-button" onclick="evnlosSave(this)">Download</button>',
         '<a class="ev-button" onclick="return evnlosShare(this)" '
