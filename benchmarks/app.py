@@ -4,7 +4,8 @@
     python benchmarks/app.py --rounds 9 --write benchmarks/results/app.md
 
 The page is started once and opened in a new browser; a control is moved by a key, and the clock runs until the
-image of the new sequence stands in the page. Needs chromium and chromedriver.
+image of the new sequence stands in the page; of a plane that changes, until its film from frames does, and
+until those with events do. Needs chromium and chromedriver.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ SEQUENCE = "document.querySelector('.ev-sheet').dataset.sequence"
 
 FIRST = "first images, from opening the address"
 READY = "controls, from opening the address"
+FILM, FILMS = "a plane that changes, ambient light: film from frames", "the same: films with events, too"
 
 
 def opened(home: str, browser: chromium.Chromium, rows: dict[str, list[float]]) -> None:
@@ -70,6 +72,15 @@ def measure(folder: Path, rounds: int) -> dict[str, list[float]]:
             for control, label in CONTROLS.items():
                 answer(browser, label, RIGHT)
                 rows[control] = [answer(browser, label, (LEFT, RIGHT)[turn % 2]) for turn in range(rounds)]
+            browser.open(f"{home.rstrip('/')}/?film=closing+hand")
+            browser.wait(f"return document.body.innerHTML.includes('>Film, both<') && {SEQUENCE}")
+            answer(browser, "Ambient light", RIGHT)
+            rows |= {FILM: [], FILMS: []}
+            for turn in range(rounds):
+                rows[FILM].append(answer(browser, "Ambient light", (LEFT, RIGHT)[turn % 2]))
+                start = time.perf_counter()
+                browser.wait("return document.body.innerHTML.includes('>Film, both<')")
+                rows[FILMS].append(rows[FILM][-1] + time.perf_counter() - start)
     return rows
 
 

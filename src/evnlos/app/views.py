@@ -227,7 +227,8 @@ def from_film(
     found = _film_solver(setup, plane).film(times_s, frames, events, peak=recorded.peak, count=len(times_s))
     images = np.repeat(found.mean.astype(np.float32), step, axis=0)[: len(recorded)]
     seen = {"frames": "frames", "events": "events", "both": "frames and events"}[evidence]
-    note = f"{'all' if step == 1 else f'one in {step}'} {seen}, nothing learned"
+    known = "guessed" if taken else "known"
+    note = f"{'all' if step == 1 else f'one in {step}'} {seen}, setup {known}, nothing learned"
     truth = film_truth(recorded)
     if truth is not None:
         low, high = found.interval()
