@@ -366,7 +366,7 @@ class LiveCommand:
                     model = load_model(name)
                     say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
                 engine = Engine(model.weights)
-                verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE, is_stated=False)
+                verdict = verdict_on(model.known(), None, _LIVE_CONFIDENCE, is_stated=False)
                 if self.so_far is not None:
                     beside = so_far_of(self.so_far, self.source)
                     say("what makes the images of all so far starts, which takes some seconds")

@@ -68,11 +68,12 @@ class ReconstructCommand:
         """Reconstruct and print where the images are."""
         from evnlos.data import pattern_of
         from evnlos.report import reconstruct_capture
-        from evnlos.setups import lit_setup
+        from evnlos.setups import lit_setup, stated_target_m
 
         setup = lit_setup(self.setup) if self.setup else None
         how: dict[str, Any] = {"setup": setup, "pattern": pattern_of(self.setup, self.pattern)}
         how |= {"track": self.track, "so_far": self.so_far}
+        how["target_m"] = stated_target_m(self.setup) if self.setup else None
         with ProgressBars() as progress:
             found = reconstruct_capture(self.capture, self.weights, self.out, **how, progress=progress)
         for warning in found.get("warnings", []):
@@ -321,7 +322,7 @@ class IdentifyCommand:
         with ProgressBars() as progress:
             for one in setups:
                 with progress.stage("identify", f"{one.name}: modes above the noise", len(found), stages):
-                    found.append(identify(one.setup, self.settings, one.name, self.seed))
+                    found.append(identify(one.setup, self.settings, one.name, self.seed, one.target_m))
             for one in setups if self.bounds else ():
                 done = len(found) + len(limits)
                 with progress.stage("identify", f"{one.name}: moving targets", done, stages):
@@ -386,7 +387,9 @@ class ReportCommand:
             dataset, results = collect_results(list(self.runs), self.data, self.split, progress=progress)
             with progress.stage("report", "what the setup can show", 0, 2):
                 setup = None if self.setup is None else named_setup(self.setup)
-                limits = None if setup is None else identify(setup.setup, name=setup.name)
+                limits = (
+                    None if setup is None else identify(setup.setup, name=setup.name, stated_m=setup.target_m)
+                )
                 if setup is None and dataset.origin == "simulation":
                     setup = named_setup(self.data / "dataset.yaml")
             with progress.stage("report", "images, films and page", 1, 2):
