@@ -214,12 +214,11 @@ def track_values(capture: Capture, track: Track, scene: Scene | None) -> dict[st
         found["size_change"] = float(track.size[-1] / track.size[0])
     if track.misfit is not None:
         found["misfit"] = track.misfit
-    if track.distance is not None:
-        away = track.distance
+    if (away := track.distance) is not None:
         found["distance"] = [float(away.distance_m[0]), float(away.distance_m[-1])]
         found["distance_sigma"] = float(away.distance_sigma.mean())
         found["retreat"] = float((away.distance_m[-1] - away.distance_m[0]) / np.ptp(away.time_s))
-        found["distance_spread"] = float(away.distance_m.std())
+        found |= {"distance_spread": float(away.distance_m.std()), "distance_feigned": away.feigned_m}
         found["distance_identified"] = away.is_identified
     if track.turn is not None:
         found["turn_deg"] = float(track.turn.rotation_deg[-1] - track.turn.rotation_deg[0])
@@ -252,8 +251,9 @@ def to_text(found: dict[str, Any]) -> str:
         first, last = (length("distance", of=v) for v in found["distance"])
         lines.append(
             f"distance    {first:>11} at the start, {last} at the end, +- {length('distance_sigma')}; "
-            f"{length('distance_spread')} rms about its mean, which is the setup's"
-            + ("" if found["distance_identified"] else "; not identified: its changes drown in its error")
+            f"{length('distance_spread')} rms about its mean, which is the setup's, whose errors may make "
+            f"{length('distance_feigned')} of it"
+            + ("" if found["distance_identified"] else "; not identified: its changes drown in these errors")
         )
     if "turn_deg" in found:
         lines.append(
