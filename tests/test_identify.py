@@ -161,7 +161,7 @@ def test_the_matrix_is_the_setup_that_the_lab_renders():
         RadiometricSetup(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
         RadiometricSetup(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
     ):
-        scene, settings = target_in_the_middle(), AnalysisSettings(height=12, width=20)
+        scene, settings = target_in_the_middle(), AnalysisSettings(0.08, height=12, width=20)
         seen = linearized(setup, settings)
         mask = torch.from_numpy(scene.target.rasterise(settings.target_plane)).double().flatten()
         rendered = setup.resized(settings.shape).observe(scene).irradiance(4.0)
@@ -305,8 +305,9 @@ def test_the_target_is_as_large_as_the_setup_says(tmp_path, capsys):
     main(["identify", str(tmp_path / "metres.yaml"), "main-near", *small])
     lines = capsys.readouterr().out.splitlines()
     told = [line.partition(": ")[0] for line in lines if line.startswith("On the target plane")]
+    assert [f"holds: {name}): all-black" in " ".join(lines) for name in ("metres", "main-near")] == [True, True]
     assert told == [
-        f"On the target plane of {size} (the largest that the setup's strip holds)"
+        f"On the target plane of {size} (the largest that the setup's strip holds"
         for size in ("1.6 m", "80 mm")
     ]
     assert any(line.startswith("metres: ") and "of a target of 1.6 m" in line for line in lines)

@@ -353,7 +353,7 @@ def _psnr(error: torch.Tensor) -> float:
 def setup_table(found: Sequence[Identification]) -> str:
     """Return an aligned table of setups with the same settings, between lines that hold for all of them.
 
-    Below it stands one line for each size of target that was asked about, and where that is from.
+    Below it stands a line for each size of target that was asked about: where that is from, and of which.
     """
     settings = found[0].settings
     rows = [["setup", "modes > 1e-2", "patterns", "bars, upright x lying, mm", "best linear image, dB"]]
@@ -361,12 +361,16 @@ def setup_table(found: Sequence[Identification]) -> str:
         camera, fixed = one.at_camera, one.at_noise_std
         rows.append([one.name, str(one.modes), f"{camera.patterns} / {fixed.patterns}"])
         rows[-1] += [f"{_bars(camera)} / {_bars(fixed)}", f"{camera.psnr_db:.2f} / {fixed.psnr_db:.2f}"]
-    sizes = {one.size: one for one in reversed(found)}
+    sizes = dict[AskedSize, list[Identification]]()
+    for one in found:
+        sizes.setdefault(one.size, []).append(one)
     lines = [
-        f"On the target plane of {size.words} ({size.source}): all-black {one.zero_db:.2f} dB, "
-        f"mean training target {one.mean_db:.2f} dB; typical stroke {1e3 * one.stroke_m:.1f} mm; "
+        f"On the target plane of {size.words} ({size.source}"
+        + (f": {', '.join(one.name for one in same)}" if len(sizes) > 1 else "")
+        + f"): all-black {same[0].zero_db:.2f} dB, "
+        f"mean training target {same[0].mean_db:.2f} dB; typical stroke {1e3 * same[0].stroke_m:.1f} mm; "
         f"{settings.cells} x {settings.cells} cells, {settings.height} x {settings.width} pixels."
-        for size, one in reversed(sizes.items())
+        for size, same in sizes.items()
     ]
     return (
         f"From {_frames(settings.frames)}; two figures: at the camera's noise / at "
