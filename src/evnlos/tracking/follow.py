@@ -74,7 +74,7 @@ class Tracking:
     cells: int = 20
     """With a setup: cells per side of that square."""
     depth: bool = False
-    """With a setup: also find how far the object is from the wall in each frame."""
+    """With a setup: also find how far the object is from the wall in each frame, and if that surely changes."""
     turning: bool = False
     """With a setup: also find how the object turns about the wall's normal."""
     targets: int | Literal["auto"] = 1
