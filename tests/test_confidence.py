@@ -455,7 +455,7 @@ def test_keeping_the_most_supported_first() -> None:
 def test_a_verdict_without_fonts_says_what_to_install(monkeypatch) -> None:
     """`reconstruct` and `live` ended in an error, after all their work, on an installation without extras."""
 
-    def no_fonts(*_):
+    def no_fonts(*_, **__):
         raise MissingDependencyError("no font family; pip install evnlos[fonts] brings open ones")
 
     monkeypatch.setattr(sys.modules[verdict_on.__module__], "identify", no_fonts)

@@ -11,12 +11,13 @@ import yaml
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.config import read_yaml, save_yaml
-from evnlos.data import SensorSize, Simulation
+from evnlos.data import SensorSize, Simulation, read_capture
 from evnlos.data.lab import Lab, render_captures
 from evnlos.errors import ConfigError, DataError
+from evnlos.models import published_setup
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, PathMotion, Scene
-from evnlos.setups import RadiometricSetup
-from evnlos.tracking import Tracking, track_events
+from evnlos.setups import RadiometricSetup, load_setup
+from evnlos.tracking import Tracking, track_capture, track_events
 from evnlos.tracking.event_motion import EventFit
 from evnlos.types import Events
 
@@ -65,6 +66,30 @@ def test_events_alone_tell_distance_and_turn() -> None:
     assert np.abs(off).max() < 0.03
     degrees = np.degrees(pose.rotation_rad - pose.rotation_rad.mean())
     assert np.abs(track.turn.rotation_deg - degrees).max() < 5.0
+
+
+def test_a_wrong_setup_makes_no_distance_that_changes() -> None:
+    """Thresholds a tenth off bend a constant distance by more than noise does: it passed as identified."""
+    setup, away = replace(SETUP, roughness=0.09), replace(BENT, z_m=(0.28, 0.3, 0.32, 0.3))
+    wrong = replace(setup, pixel=replace(PIXEL, threshold_on=0.165))
+    few = Tracking(target_size_m=0.1, depth=True, columns=24, cells=12)
+    for motion, told in ((BENT, False), (away, True)):
+        found = track_events(recorded(motion, setup)[1], SPAN_S, wrong, few).distance
+        assert found is not None and found.distance_m.std() > found.distance_sigma.mean()
+        assert found.feigned_m == pytest.approx(0.006) and found.is_identified is told
+    with pytest.raises(DataError, match="this wall does not show where its light comes from"):
+        matte = replace(setup, wall_material="lambert")
+        track_events(recorded(away, matte)[1], SPAN_S, matte, few)
+
+
+@pytest.mark.slow
+def test_a_capture_of_constant_distance_is_not_identified(shared_data) -> None:
+    """Found are 3.3 mm rms about the mean, where 0.75 mm are stated: errors of the setup and of its pixel."""
+    setup = load_setup(published_setup("near-event-sequence"))
+    capture = read_capture(shared_data / "captures" / "near_5", needs_frames=False)
+    found = track_capture(capture, setup, Tracking(frames=False, depth=True, turning=True)).distance
+    assert found is not None and not found.is_identified
+    assert 2 * found.distance_sigma.mean() < found.distance_m.std() < 0.8 * found.feigned_m
 
 
 def test_what_a_pose_changes_of_the_light_is_its_derivative() -> None:

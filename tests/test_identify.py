@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evnlos.analysis import AnalysisSettings, identify
-from evnlos.analysis.identify import modes_above, setup_table, singular_values, verdict
-from evnlos.analysis.linearized import LinearEstimator, bars, finest_bars, linearized
+from evnlos.analysis.identify import modes_above, setup_table, singular_values, verdict_on
+from evnlos.analysis.linearized import AskedSize, LinearEstimator, bars, finest_bars, linearized, verdict
+from evnlos.app.views import limits_of
+from evnlos.calibration import Shown
 from evnlos.cameras import FrameCamera
 from evnlos.cli import main
 from evnlos.config import save_yaml
@@ -19,8 +21,16 @@ from evnlos.data import Simulation
 from evnlos.data.lab import Lab
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import LETTERS, TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_targets, letters
-from evnlos.scene import LineMotion, Scene, Target
-from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
+from evnlos.scene import HandwritingGlyphs, LineMotion, Scene, Target, TargetPlane
+from evnlos.setups import (
+    FittedSetup,
+    PaperSetup,
+    RadiometricSetup,
+    named_setup,
+    setup_names,
+    setup_preset,
+    stated_target_m,
+)
 from evnlos.types import Plane
 
 SMALL = AnalysisSettings(cells=8, height=12, width=20, writers=1)
@@ -151,7 +161,7 @@ def test_the_matrix_is_the_setup_that_the_lab_renders():
         RadiometricSetup(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
         RadiometricSetup(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
     ):
-        scene, settings = target_in_the_middle(), AnalysisSettings(height=12, width=20)
+        scene, settings = target_in_the_middle(), AnalysisSettings(0.08, height=12, width=20)
         seen = linearized(setup, settings)
         mask = torch.from_numpy(scene.target.rasterise(settings.target_plane)).double().flatten()
         rendered = setup.resized(settings.shape).observe(scene).irradiance(4.0)
@@ -278,6 +288,58 @@ def test_command(tmp_path, capsys):
     names = {path.name for path in (tmp_path / "o").iterdir()}
     assert names == {"identify_matte-near.png", "identify_hard-far.png", "identify_setups.png", "identify.json"}
     assert len(json.loads((tmp_path / "o" / "identify.json").read_text())) == 2
+
+
+METRES = RadiometricSetup(distance_m=6.0, camera_distance_m=12.0, cell_m=0.05, strip_m=(4.8, 1.6))
+"""main-near, twenty times as large."""
+
+
+def test_the_target_is_as_large_as_the_setup_says(tmp_path, capsys):
+    """Of 8 cm, which nobody asked about, a scene of metres showed nothing at all: a false no."""
+    near, metres = identify(setup_preset("main-near"), SMALL), identify(METRES, SMALL)
+    assert metres.settings.target_size_m == 1.6 and metres.at_camera.patterns == near.at_camera.patterns > 5
+    assert identify(METRES, dataclasses.replace(SMALL, target_size_m=0.08)).at_camera.patterns < 3
+    assert linearized(METRES, SMALL).target_plane.extent_m == pytest.approx((1.6, 1.6))
+    small = ["--cells", "8", "--height", "12", "--width", "20", "--writers", "1"]
+    save_yaml(METRES, tmp_path / "metres.yaml")
+    main(["identify", str(tmp_path / "metres.yaml"), "main-near", *small])
+    lines = capsys.readouterr().out.splitlines()
+    told = [line.partition(": ")[0] for line in lines if line.startswith("On the target plane")]
+    assert [f"holds: {name}): all-black" in " ".join(lines) for name in ("metres", "main-near")] == [True, True]
+    assert told == [
+        f"On the target plane of {size} (the largest that the setup's strip holds"
+        for size in ("1.6 m", "80 mm")
+    ]
+    assert any(line.startswith("metres: ") and "of a target of 1.6 m" in line for line in lines)
+    main(["identify", str(tmp_path / "metres.yaml"), "--target-size-m", "0.5", "--json", *small])
+    found = json.loads(capsys.readouterr().out)
+    assert (found["analysis"]["target_size_m"], found["target_size_from"]) == (0.5, "as asked")
+
+
+def test_all_ask_about_the_targets_that_the_file_states(tmp_path, capsys):
+    """The strip leaves room that no target fills; what is calibrated states how large its targets were."""
+    glyphs = HandwritingGlyphs(target_plane=TargetPlane(size_m=1.2))
+    simulation, path = Simulation(glyphs=glyphs, setup=METRES), tmp_path / "setup.yaml"
+    save_yaml(simulation, path)
+    assert stated_target_m(path) == stated_target_m(tmp_path) == named_setup(path).target_m == 1.2
+    main(["identify", str(tmp_path), "--cells", "16", "--writers", "2", "--json"])
+    found, page = json.loads(capsys.readouterr().out), limits_of(simulation)
+    assert found["analysis"]["target_size_m"] == page.settings.target_size_m == 1.2
+    assert found["camera_noise"]["patterns_above_noise"] == page.at_camera.patterns
+    shown, told = Shown.by(simulation), verdict_on(named_setup(path), None)
+    assert shown.patterns == page.at_camera.patterns and told.wall == page.wall
+    assert "of this wall and a target of 1.2 m, " in told.wall
+    lab = Lab(glyphs=dataclasses.replace(Lab().glyphs, target_plane=TargetPlane(size_m=0.5)), setup=METRES)
+    save_yaml(lab, tmp_path / "lab.yaml")
+    assert stated_target_m(tmp_path / "lab.yaml") == 0.5
+
+
+@pytest.mark.parametrize("name", [*setup_names(), "worn", "workshop", "simulate-paper", "simulate-page"])
+def test_named_setups_are_asked_about_8_cm(name):
+    """Their documented figures are of it."""
+    found = named_setup(name)
+    assert found.target_m is None and AskedSize.of(found.setup).size_m == 0.08
+    assert AskedSize.of(FittedSetup(cell_m=0.08 / 17)).size_m == 0.08
 
 
 def test_setup_files(tmp_path):

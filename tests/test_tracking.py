@@ -866,9 +866,15 @@ def test_what_the_recording_does_not_tell_is_not_identified() -> None:
     times, blank = np.linspace(0, 1, 5), np.zeros(5)
     for sigma, told in ((2.0, True), (20.0, False)):  # a round target turns unseen
         assert Turn(times, np.linspace(-20, 20, 5), np.full(5, sigma), blank, blank).is_identified is told
-    for change, sigma, told in ((0.02, 0.002, True), (0.001, 0.002, False), (0.1, 0.02, False)):
+    for change, sigma, feigned_m, told in (
+        (0.02, 0.002, 0.0, True),
+        (0.001, 0.002, 0.0, False),
+        (0.1, 0.02, 0.0, False),
+        (0.02, 0.002, 0.006, True),
+        (0.005, 0.0008, 0.006, False),  # what a calibrated setup gets wrong
+    ):
         away = 0.3 + change * np.linspace(-1, 1, 5)
-        assert Distance(times, away, np.full(5, sigma), blank, blank).is_identified is told
+        assert Distance(times, away, np.full(5, sigma), blank, blank, feigned_m).is_identified is told
     frames = np.zeros((5, 24, 36), np.float32)
     for settings in (Tracking(turning=True), Tracking(depth=True)):
         with pytest.raises(ConfigError, match="needs a setup"):
@@ -1009,7 +1015,7 @@ def test_the_number_of_objects_is_found_with_their_paths(count) -> None:
 @pytest.mark.parametrize(("least", "stated", "found"), [(0.01, 0.0, 1), (0.0, 0.0, 2), (0.0, 0.01, 1)])
 def test_an_error_of_the_setup_is_no_second_object(monkeypatch, least, stated, found) -> None:
     """An unknown texture of 1 % makes up a second object, unless errors of that size are allowed."""
-    monkeypatch.setattr("evnlos.tracking.motion_fit.LEAST_ERROR", least)
+    monkeypatch.setattr("evnlos.setups.base.LEAST_ERROR", least)
     monkeypatch.setattr(RadiometricSetup, "unexplained", stated)
     _, times, scenes = several_frames(1)
     light = WIDE.observe(scenes[0]).irradiance(times).numpy() - WIDE.ambient_light().numpy()

@@ -39,7 +39,7 @@ from evnlos.inverse.sequence_problem import position_subsets
 from evnlos.machine import note
 from evnlos.scene import LineMotion
 from evnlos.setups import Setup
-from evnlos.types import Plane, aligned
+from evnlos.types import Plane, aligned, length_text
 
 _GRID = (50, 80)  # pixels at which the sensor is looked at
 _REFERENCES = "AS2"  # characters that the prior does not know
@@ -169,9 +169,10 @@ class Bounds:
         head = [f"{self.name}: expected PSNR, dB, of n positions", *map(str, self.settings.counts)]
         rows = [head, *([name, *(f"{value:.1f}" for value in values)] for name, values in named)]
         counts = {one.kind: f"{one.kind} {one.per_pixel:.2f}" for one in self.events}
+        size = length_text(self.settings.target_size_m, digits=0)
         remarks = (
-            f"Prior alone {self.prior_db:.2f} dB. Per cent: error of a crossing, log units. Crossings per "
-            f"pixel of the whole sequence: {', '.join(counts.values())}."
+            f"Prior alone {self.prior_db:.2f} dB, of a target of {size}. Per cent: error of a crossing, log "
+            f"units. Crossings per pixel of the whole sequence: {', '.join(counts.values())}."
         )
         if in_columns:
             return f"{aligned(rows)}\n{remarks}"

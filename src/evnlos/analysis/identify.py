@@ -14,64 +14,23 @@ import torch
 
 from evnlos.analysis.linearized import (
     AnalysisSettings,
+    AskedSize,
     LinearEstimator,
     LinearizedSetup,
     artifact_note,
     finest_bars,
     linearized,
     scan_notes,
+    verdict,
 )
 from evnlos.errors import MissingDependencyError
 from evnlos.machine import note
-from evnlos.setups import Setup
+from evnlos.setups import NamedSetup, Setup
 from evnlos.types import aligned, derive_seed
 
 if TYPE_CHECKING:
     from evnlos.inverse.prior import TargetPrior
     from evnlos.models import ConfidenceReport
-
-_SHAPE = 4  # bars of a quarter of the target plane tell where a letter is filled and where it is open
-
-
-def verdict(
-    patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, target_size_m: float
-) -> str:
-    """Return in a sentence what a reconstruction with this setup would be.
-
-    Strokes are measured where bars of their width are resolved in both directions; the rough shape where bars
-    of a quarter of the target plane are.
-
-    Args:
-        patterns: Patterns in which handwritten targets differ by more than the noise.
-        finest_m: Width of the finest upright and lying bars that are resolved, metres; None where none are.
-        stroke_m: Typical stroke of the targets, metres.
-        target_size_m: Side of the target plane, metres.
-
-    Example:
-        >>> verdict(3, (None, None), 0.008, 0.08).split(": ")[1]
-        'a legible reconstruction would come from the training data, not from the measurement.'
-    """
-    upright, lying = finest_m
-    resolved = [width for width in finest_m if width is not None]
-    if not resolved:
-        bars = "no bars at all"
-    elif len(resolved) == 1:
-        there, missing = ("upright", "lying") if lying is None else ("lying", "upright")
-        bars = f"{there} bars down to {1e3 * resolved[0]:.1f} mm, {missing} ones not at all"
-    else:
-        bars = f"bars down to {1e3 * max(resolved):.1f} mm"
-    finest = None if upright is None or lying is None else max(upright, lying)
-    if finest is not None and finest <= stroke_m:
-        meaning = (
-            f"strokes of {1e3 * stroke_m:.1f} mm are measured; finer detail would come from the training data"
-        )
-    elif finest is not None and finest <= target_size_m / _SHAPE:
-        fine = f"strokes of {1e3 * stroke_m:.1f} mm are too fine for this wall"
-        meaning = f"the rough shape is measured, {fine}: their detail would come from the training data"
-    else:
-        meaning = "a legible reconstruction would come from the training data, not from the measurement"
-    return f"From one frame of this wall {patterns} patterns can be distinguished, and {bars}: {meaning}."
-
 
 MODE_LEVEL = 1e-2
 """Singular values above this share of the largest count as usable modes."""
@@ -128,6 +87,7 @@ class Identification:
         at_noise_std: At the fixed noise of the settings.
         verdict: The same in words.
         warnings: What makes the figures look better than they are.
+        source: Who says how large the target is, in words.
     """
 
     name: str
@@ -143,6 +103,12 @@ class Identification:
     at_noise_std: NoiseLevelResult
     verdict: str
     warnings: tuple[str, ...] = ()
+    source: str = "as asked"
+
+    @property
+    def size(self) -> AskedSize:
+        """How large the target is, and who says so."""
+        return AskedSize(self.settings.target_plane.extent_m[0], self.source)
 
     @property
     def wall(self) -> str:
@@ -152,7 +118,7 @@ class Identification:
     def allowed(self, which: str) -> str:
         """Return what the wall allows, as `wall`, with a name for it: `which`."""
         told = self.verdict.partition(": ")[2].removesuffix(".")
-        return f"from {_frames(self.settings.frames)} of {which}, {told}"
+        return f"from {_frames(self.settings.frames)} of {which} and a target of {self.size.words}, {told}"
 
     def summary(self, arrays: bool = False) -> dict[str, Any]:
         """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
@@ -164,6 +130,7 @@ class Identification:
             "psnr_zero_db": round(self.zero_db, 2),
             "psnr_mean_db": round(self.mean_db, 2),
             "typical_stroke_m": round(self.stroke_m, 5),
+            "target_size_from": self.source,
             "analysis": asdict(self.settings),
             "settings": asdict(self.setup),
         }
@@ -185,7 +152,11 @@ class Identification:
 
 
 def identify(
-    setup: Setup, settings: AnalysisSettings | None = None, name: str = "setup", seed: int = 0
+    setup: Setup,
+    settings: AnalysisSettings | None = None,
+    name: str = "setup",
+    seed: int = 0,
+    stated_m: float | None = None,
 ) -> Identification:
     """Say what one image of the wall can show of a target at a known place, whatever the method.
 
@@ -199,6 +170,8 @@ def identify(
         settings: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
         name: What to call the setup.
         seed: Seed of the one image that is drawn with noise.
+        stated_m: Side of the targets that the setup's file states (`stated_target_m`), metres; it counts where
+            the settings name none.
 
     Raises:
         ConfigError: The setup is geometrically impossible, or the camera gets no light from the target.
@@ -211,6 +184,8 @@ def identify(
         3
     """
     settings = settings or AnalysisSettings()
+    size = AskedSize.of(setup, settings.target_size_m, stated_m)
+    settings = replace(settings, target_size_m=size.size_m)
     seen = linearized(setup, settings)
     from evnlos.inverse.prior import handwritten_targets
 
@@ -247,10 +222,11 @@ def identify(
         targets.test[targets.typical].reshape(settings.target_plane.shape),
         at_camera,
         at_noise_std,
-        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, settings.target_size_m).replace(
+        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, size.size_m).replace(
             "one frame", _frames(settings.frames)
         ),
         tuple(warnings),
+        size.source,
     )
 
 
@@ -287,7 +263,7 @@ class Verdict:
 
 
 def verdict_on(
-    setup: Setup | None,
+    setup: Setup | NamedSetup | None,
     report: ConfidenceReport | None,
     no_confidence: str | None = None,
     frames: int = 1,
@@ -296,7 +272,8 @@ def verdict_on(
     """Return the verdict on a reconstruction.
 
     Args:
-        setup: The setup that the recording is taken to be of, where it is known and linear.
+        setup: The setup that the recording is taken to be of, where it is known and linear; a named one says
+            how large its targets are.
         report: How far to believe the images, where that can be told.
         no_confidence: Why it can't be told.
         frames: Frames that an image is made of: all of a network of whole sequences, else 1.
@@ -304,9 +281,10 @@ def verdict_on(
             weights, and where nothing was measured it says nothing of this wall.
     """
     wall, which = "", "this wall" if is_stated else "the wall that these weights know"
+    setup, stated_m = (setup.setup, setup.target_m) if isinstance(setup, NamedSetup) else (setup, None)
     try:
         if setup is not None and setup.is_linear and (is_stated or report is None or report.measured):
-            wall = identify(setup, replace(QUICK, frames=frames)).allowed(which)
+            wall = identify(setup, replace(QUICK, frames=frames), stated_m=stated_m).allowed(which)
     except MissingDependencyError as error:  # of handwriting; the images stand without the answer
         wall = f"what the wall allows is not known: {error}"
     if report is None:
@@ -373,19 +351,30 @@ def _psnr(error: torch.Tensor) -> float:
 
 
 def setup_table(found: Sequence[Identification]) -> str:
-    """Return an aligned table of setups with the same settings, between lines that hold for all of them."""
-    first, settings = found[0], found[0].settings
+    """Return an aligned table of setups with the same settings, between lines that hold for all of them.
+
+    Below it stands a line for each size of target that was asked about: where that is from, and of which.
+    """
+    settings = found[0].settings
     rows = [["setup", "modes > 1e-2", "patterns", "bars, upright x lying, mm", "best linear image, dB"]]
     for one in found:
         camera, fixed = one.at_camera, one.at_noise_std
         rows.append([one.name, str(one.modes), f"{camera.patterns} / {fixed.patterns}"])
         rows[-1] += [f"{_bars(camera)} / {_bars(fixed)}", f"{camera.psnr_db:.2f} / {fixed.psnr_db:.2f}"]
+    sizes = dict[AskedSize, list[Identification]]()
+    for one in found:
+        sizes.setdefault(one.size, []).append(one)
+    lines = [
+        f"On the target plane of {size.words} ({size.source}"
+        + (f": {', '.join(one.name for one in same)}" if len(sizes) > 1 else "")
+        + f"): all-black {same[0].zero_db:.2f} dB, "
+        f"mean training target {same[0].mean_db:.2f} dB; typical stroke {1e3 * same[0].stroke_m:.1f} mm; "
+        f"{settings.cells} x {settings.cells} cells, {settings.height} x {settings.width} pixels."
+        for size, same in sizes.items()
+    ]
     return (
         f"From {_frames(settings.frames)}; two figures: at the camera's noise / at "
-        f"{100 * settings.noise_std:g} % of white.\n{aligned(rows)}\n"
-        f"On the target plane of {1e3 * settings.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
-        f"mean training target {first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
-        f"{settings.cells} x {settings.cells} cells, {settings.height} x {settings.width} pixels."
+        f"{100 * settings.noise_std:g} % of white.\n{aligned(rows)}\n" + "\n".join(lines)
     )
 
 

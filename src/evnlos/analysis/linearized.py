@@ -1,31 +1,69 @@
 """A setup as a matrix with a noise, and the best linear estimate that it allows.
 
-- A setup as a matrix with a noise: what every question about its limits starts from.
+- A setup as a matrix with a noise: what every question about its limits starts from, of a target of its size.
 - The best linear estimate of a target from one image of the wall, and how wrong it is on average.
-- What a matrix can't say about a setup, in words: what its model adds to a wall, a scan's noise and cells.
+- What they say of a setup, in words, and what a matrix can't: what its model adds to a wall, a scan's noise.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import note
 from evnlos.setups import OperatorNoise, Setup
-from evnlos.types import Plane
+from evnlos.types import Plane, length_text
 
 _EXTRA_MODES = 1.1
+_USUAL_SIZE_M = 0.08
+
+
+class AskedSize(NamedTuple):
+    """Side of the target plane that a question about a setup is of, metres, and who says so, in words."""
+
+    size_m: float
+    source: str
+
+    @classmethod
+    def of(cls, setup: Setup, asked_m: float | None = None, stated_m: float | None = None) -> AskedSize:
+        """Return the side that the caller names, or that of the setup's targets, the strip's, or 8 cm.
+
+        Args:
+            setup: The setup; the largest square that its cells of targets hold counts where no side is given.
+            asked_m: Side that the caller names, metres; None: the setup's.
+            stated_m: Side of the targets that the setup's file states beside it, metres; None: it states none.
+
+        Example:
+            >>> from evnlos.setups import RadiometricSetup
+            >>> AskedSize.of(RadiometricSetup(cell_m=0.05, strip_m=(4.8, 1.6)))
+            AskedSize(size_m=1.6, source="the largest that the setup's strip holds")
+        """
+        if asked_m is not None:
+            return cls(asked_m, "as asked")
+        if stated_m is not None:
+            return cls(stated_m, "as the setup's file states of its targets")
+        cells = setup.target_cells()
+        if cells is None:
+            return cls(_USUAL_SIZE_M, "taken for granted, as the setup states none")
+        return cls(round(min(cells.extent_m), 6), "the largest that the setup's strip holds")
+
+    @property
+    def words(self) -> str:
+        """The side alone, in words."""
+        return length_text(self.size_m, digits=0)
 
 
 @dataclass(frozen=True)
 class AnalysisSettings:
     """How the question is put: cells of the target plane, pixels of the camera, noise."""
 
-    target_size_m: float = 0.08
-    """Side of the target plane, in the middle of its travel, metres."""
+    target_size_m: float | None = None
+    """Side of the target plane, in the middle of its travel, metres; none = that of the targets in the setup's
+    file, else the largest that its strip holds, 0.08 where it has none."""
     cells: int = 32
     """Cells a side of the target plane."""
     height: int = 60
@@ -51,18 +89,65 @@ class AnalysisSettings:
             )
         for name in ("target_size_m", "noise_std"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
+            if value is not None and not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"AnalysisSettings.{name} is {value}; give a positive number")
 
     @property
     def target_plane(self) -> Plane:
-        """The cells of the target plane."""
-        return Plane(self.cells, self.cells, self.target_size_m / self.cells)
+        """The cells of the target plane, of 8 cm where nobody says its side."""
+        return Plane(self.cells, self.cells, (self.target_size_m or _USUAL_SIZE_M) / self.cells)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Size (H, W) of the camera image, pixels."""
         return self.height, self.width
+
+
+_SHAPE = 4  # bars of a quarter of the target plane tell where a letter is filled and where it is open
+
+
+def verdict(
+    patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, target_size_m: float
+) -> str:
+    """Return in a sentence what a reconstruction with this setup would be.
+
+    Strokes are measured where bars of their width are resolved in both directions; the rough shape where bars
+    of a quarter of the target plane are.
+
+    Args:
+        patterns: Patterns in which handwritten targets differ by more than the noise.
+        finest_m: Width of the finest upright and lying bars that are resolved, metres; None where none are.
+        stroke_m: Typical stroke of the targets, metres.
+        target_size_m: Side of the target plane, metres.
+
+    Example:
+        >>> verdict(3, (None, None), 0.008, 0.08).split(": ")[1]
+        'a legible reconstruction would come from the training data, not from the measurement.'
+    """
+    upright, lying = finest_m
+    resolved = [width for width in finest_m if width is not None]
+    if not resolved:
+        bars = "no bars at all"
+    elif len(resolved) == 1:
+        there, missing = ("upright", "lying") if lying is None else ("lying", "upright")
+        bars = f"{there} bars down to {1e3 * resolved[0]:.1f} mm, {missing} ones not at all"
+    else:
+        bars = f"bars down to {1e3 * max(resolved):.1f} mm"
+    finest = None if upright is None or lying is None else max(upright, lying)
+    if finest is not None and finest <= stroke_m:
+        meaning = (
+            f"strokes of {1e3 * stroke_m:.1f} mm are measured; finer detail would come from the training data"
+        )
+    elif finest is not None and finest <= target_size_m / _SHAPE:
+        fine = f"strokes of {1e3 * stroke_m:.1f} mm are too fine for this wall"
+        meaning = f"the rough shape is measured, {fine}: their detail would come from the training data"
+    else:
+        meaning = "a legible reconstruction would come from the training data, not from the measurement"
+    size = length_text(target_size_m, digits=0)
+    return (
+        f"From one frame of this wall {patterns} patterns can be distinguished of a target of {size}, "
+        f"and {bars}: {meaning}."
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +191,8 @@ def linearized(setup: Setup, settings: AnalysisSettings = AnalysisSettings()) ->
         >>> seen.matrix.shape, 0.2 < seen.white < 0.5
         (torch.Size([240, 64]), True)
     """
-    setup = setup.resized(settings.shape)
+    size = AskedSize.of(setup, settings.target_size_m)
+    setup, settings = setup.resized(settings.shape), replace(settings, target_size_m=size.size_m)
     note("light path")
     matrix = setup.linear_part(settings.target_plane).dense()
     if not float(matrix.max()) > 0:

@@ -31,7 +31,7 @@ from evnlos.machine import Progress, counted, note, silent
 from evnlos.metrics import psnr
 from evnlos.models import ConfidenceReport, Reconstructor, Weights, load_weights, published_setup
 from evnlos.scene import Motion
-from evnlos.setups import Setup, load_setup
+from evnlos.setups import NamedSetup, Setup, named_setup
 
 _SAME_LIGHT = (0.75, 1.33)
 """Range of a recording's brightness, in that of its calibrated setup, in which the setup's gain is its own."""
@@ -129,10 +129,14 @@ class Model:
 
     def known_setup(self) -> Setup | None:
         """Return the setup that the network was trained for; None where it is unknown."""
+        return None if (found := self.known()) is None else found.setup
+
+    def known(self) -> NamedSetup | None:
+        """Return `known_setup` with its name and the side of its targets."""
         for named in filter(None, (self.weights.sampling.setup, self._known_setup)):
             with suppress(ConfigError, DataError):  # moved, or of another machine
-                found = load_setup(named)
-                return found if found.is_linear else None
+                found = named_setup(named)
+                return found if found.setup.is_linear else None
         return None
 
     def reconstruct(
@@ -169,10 +173,9 @@ class Model:
         if so_far:
             shown = weights.network.seeing(replace(weights.sampling, surface="so-far"))
             weights = replace(weights, network=_causal(shown, "leave --so-far away, or take other weights"))
-        path, odd = (None, list[str]()) if tracked is None else _path_of(capture, tracked, pattern)
+        path, warnings = (None, list[str]()) if tracked is None else _path_of(capture, tracked, pattern)
         samples = capture_samples(replace(capture, path=path), weights.sampling, pattern)
-        stated, warnings = capture.info.motion, odd
-        if stated is not None and (stated.retreat_m_s or stated.spin_deg_s):
+        if (stated := capture.info.motion) is not None and (stated.retreat_m_s or stated.spin_deg_s):
             warnings.append(
                 f"capture.yaml states a retreat of {stated.retreat_m_s:g} m/s and a spin of "
                 f"{stated.spin_deg_s:g} deg/s; networks know upright targets at one distance, and take x "
@@ -181,9 +184,8 @@ class Model:
         note("network")
         images = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
         unjudged = why_no_confidence(weights, samples)
-        judge = setup
-        if judge is None and unjudged is None:  # an operator takes a second to make
-            judge = self.known_setup()
+        # An operator takes a second to make.
+        judge = self.known_setup() if setup is None and unjudged is None else setup
         note("light path")
         operator = None if judge is None else FrameOperator(judge, weights.sampling)
         note("confidence")
@@ -203,8 +205,7 @@ class Model:
         )
         if setup is None or operator is None or not capture.has_frames:
             return found
-        frames = torch.from_numpy(samples.frame)
-        found = replace(found, light=light_gain(images, frames, operator))
+        found = replace(found, light=light_gain(images, frames := torch.from_numpy(samples.frame), operator))
         if not found.is_moved:
             return found
         images = consistent(images, frames, operator)

@@ -311,8 +311,8 @@ def _against(
 
 
 @lru_cache(maxsize=64)
-def _identified(setup: Setup) -> Identification:
-    return identify(setup, QUICK)
+def _identified(setup: Setup, target_m: float) -> Identification:
+    return identify(setup, QUICK, stated_m=target_m)
 
 
 def limits_of(simulation: Simulation) -> Identification:
@@ -323,7 +323,7 @@ def limits_of(simulation: Simulation) -> Identification:
         ConfigError: The setup is geometrically impossible, or the camera gets no light.
     """
     # The event pixel is no part of the question: one answer for all of its settings.
-    return _identified(replace(simulation.setup, pixel=EventPixel()))
+    return _identified(replace(simulation.setup, pixel=EventPixel()), simulation.glyphs.target_plane.size_m)
 
 
 _LONGEST_SIDE = 320  # of an image of the wall or of events: a page shows no more

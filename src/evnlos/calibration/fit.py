@@ -82,9 +82,8 @@ class Shown:
     @classmethod
     def by(cls, simulation: Simulation) -> Shown | None:
         """Return what the setup of a simulation shows of its targets; None where it has no linear part."""
-        question = replace(QUICK, target_size_m=simulation.glyphs.target_plane.size_m)
         try:
-            found = identify(simulation.setup, question)
+            found = identify(simulation.setup, QUICK, stated_m=simulation.glyphs.target_plane.size_m)
         except ConfigError:
             return None
         return cls(found.at_camera.patterns, found.at_camera.psnr_db - found.mean_db)

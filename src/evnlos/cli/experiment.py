@@ -364,7 +364,7 @@ class LiveCommand:
                     model = load_model(name)
                     say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
                 engine, why = Engine(model and model.weights), _LIVE_CONFIDENCE if model else _FILM_CONFIDENCE
-                wall, seen = (model.known_setup(), engine.modality.name) if model else (wall, "no network")
+                wall, seen = (model.known(), engine.modality.name) if model else (wall, "no network")
                 verdict = verdict_on(wall, None, why, is_stated=model is None)
                 verdict = verdict if model else replace(verdict, guessed="")  # no network draws
                 if self.so_far is not None:

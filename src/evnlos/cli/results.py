@@ -68,11 +68,12 @@ class ReconstructCommand:
         """Reconstruct and print where the images are."""
         from evnlos.data import pattern_of
         from evnlos.report import reconstruct_capture
-        from evnlos.setups import lit_setup
+        from evnlos.setups import lit_setup, stated_target_m
 
         setup = lit_setup(self.setup) if self.setup else None
         how: dict[str, Any] = {"setup": setup, "pattern": pattern_of(self.setup, self.pattern)}
         how |= {"track": self.track, "so_far": self.so_far}
+        how["target_m"] = stated_target_m(self.setup) if self.setup else None
         with ProgressBars() as progress:
             found = reconstruct_capture(self.capture, self.weights, self.out, **how, progress=progress)
         for warning in found.get("warnings", []):
@@ -213,12 +214,11 @@ def track_values(capture: Capture, track: Track, scene: Scene | None) -> dict[st
         found["size_change"] = float(track.size[-1] / track.size[0])
     if track.misfit is not None:
         found["misfit"] = track.misfit
-    if track.distance is not None:
-        away = track.distance
+    if (away := track.distance) is not None:
         found["distance"] = [float(away.distance_m[0]), float(away.distance_m[-1])]
         found["distance_sigma"] = float(away.distance_sigma.mean())
         found["retreat"] = float((away.distance_m[-1] - away.distance_m[0]) / np.ptp(away.time_s))
-        found["distance_spread"] = float(away.distance_m.std())
+        found |= {"distance_spread": float(away.distance_m.std()), "distance_feigned": away.feigned_m}
         found["distance_identified"] = away.is_identified
     if track.turn is not None:
         found["turn_deg"] = float(track.turn.rotation_deg[-1] - track.turn.rotation_deg[0])
@@ -251,8 +251,9 @@ def to_text(found: dict[str, Any]) -> str:
         first, last = (length("distance", of=v) for v in found["distance"])
         lines.append(
             f"distance    {first:>11} at the start, {last} at the end, +- {length('distance_sigma')}; "
-            f"{length('distance_spread')} rms about its mean, which is the setup's"
-            + ("" if found["distance_identified"] else "; not identified: its changes drown in its error")
+            f"{length('distance_spread')} rms about its mean, which is the setup's, whose errors may make "
+            f"{length('distance_feigned')} of it"
+            + ("" if found["distance_identified"] else "; not identified: its changes drown in these errors")
         )
     if "turn_deg" in found:
         lines.append(
@@ -321,7 +322,7 @@ class IdentifyCommand:
         with ProgressBars() as progress:
             for one in setups:
                 with progress.stage("identify", f"{one.name}: modes above the noise", len(found), stages):
-                    found.append(identify(one.setup, self.settings, one.name, self.seed))
+                    found.append(identify(one.setup, self.settings, one.name, self.seed, one.target_m))
             for one in setups if self.bounds else ():
                 done = len(found) + len(limits)
                 with progress.stage("identify", f"{one.name}: moving targets", done, stages):
@@ -386,7 +387,9 @@ class ReportCommand:
             dataset, results = collect_results(list(self.runs), self.data, self.split, progress=progress)
             with progress.stage("report", "what the setup can show", 0, 2):
                 setup = None if self.setup is None else named_setup(self.setup)
-                limits = None if setup is None else identify(setup.setup, name=setup.name)
+                limits = (
+                    None if setup is None else identify(setup.setup, name=setup.name, stated_m=setup.target_m)
+                )
                 if setup is None and dataset.origin == "simulation":
                     setup = named_setup(self.data / "dataset.yaml")
             with progress.stage("report", "images, films and page", 1, 2):

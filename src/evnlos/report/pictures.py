@@ -33,7 +33,7 @@ from evnlos.events.volume import OFF_RGB, ON_RGB, WORDS
 from evnlos.files import check_folder, new_folder, write_atomically
 from evnlos.machine import Progress, Step, silent
 from evnlos.models import ConfidenceReport, published_for
-from evnlos.setups import Setup
+from evnlos.setups import NamedSetup, Setup
 
 _COLOURS = ("#0b5fa5", "#b23a12", "#2f7d32", "#7a3fa0", "#8a6d00", "#00788a", "#a02c5d", "#5b6470", "#3d4fc4")
 _WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM = 980, 300, 60, 16, 40
@@ -164,10 +164,7 @@ def data_uri(content: bytes, kind: str = "image/png") -> str:
 def _encoded(pictures: Sequence[NDArray[np.uint8]], kind: str, zoom: int, **options: int) -> bytes:
     images = [Image.fromarray(np.ascontiguousarray(p)) for p in pictures]
     if zoom > 1:
-        images = [
-            image.resize((image.width * zoom, image.height * zoom), Image.Resampling.NEAREST)
-            for image in images
-        ]
+        images = [one.resize((zoom * one.width, zoom * one.height), Image.Resampling.NEAREST) for one in images]
     buffer = io.BytesIO()
     if len(images) > 1:
         options["save_all"] = True
@@ -187,6 +184,7 @@ def reconstruct_capture(
     track: bool = False,
     so_far: bool = False,
     progress: Progress = silent,
+    target_m: float | None = None,
 ) -> dict[str, Any]:
     """Reconstruct all positions of a capture and write them as images.
 
@@ -209,6 +207,7 @@ def reconstruct_capture(
             known, stays where the capture states it.
         so_far: Whether each image is made of what was seen up to its position alone.
         progress: Called at each of three stages, and at the end.
+        target_m: Side of the targets that the setup's file states, metres (`stated_target_m`).
 
     Returns:
         Capture, weights, modality, number of positions, and whether all of them show one image, which was
@@ -275,7 +274,8 @@ def reconstruct_capture(
             truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
             found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
         of = (len(images) if model.weights.network.sees_sequence else 1), setup is not None
-        verdict = verdict_on(setup or model.known_setup(), confidence, made.no_confidence, *of)
+        wall = model.known() if setup is None else NamedSetup(setup, "", "", target_m)
+        verdict = verdict_on(wall, confidence, made.no_confidence, *of)
         found |= {"verdict": asdict(verdict), "in_words": _in_words(found, verdict, track)}
         title = f"{recording.name}, reconstructed by {found['weights']}"
         sheet = result_sheet(title, images.numpy(), samples, sampling, confidence, found["in_words"])

@@ -11,6 +11,7 @@ from evnlos.setups.load import (
     named_setup,
     setup_names,
     setup_preset,
+    stated_target_m,
 )
 from evnlos.setups.measured import MeasuredSetup
 from evnlos.setups.paper import PaperSetup
@@ -39,4 +40,5 @@ __all__ = [
     "setup_names",
     "setup_preset",
     "stated_distance_m",
+    "stated_target_m",
 ]

@@ -32,6 +32,9 @@ CAMERA_FIELDS = ("sensor", "frame_camera", "pixel", "time_step_s")
 LIGHT_FIELDS = ("gain", "ambient", "ambient_gradient")
 """Settings of a setup's light: they scale and add up, and change no geometry."""
 _PROBES = 65  # instants at which a scene's pose is looked at
+LEAST_ERROR = 0.01
+"""Share of the light that any setup is taken to get wrong; no target is told by less of it."""
+_WORSE = 2.0  # of one recording's share that its setup gets wrong, over that of all captures held out
 _SAME_ASPECT = 0.03  # difference of logarithms: images of whole pixels hardly keep a sensor's ratio
 
 
@@ -170,6 +173,11 @@ class Setup(Kinded, ABC):
     def event_camera(self) -> EventCamera:
         """The event camera: an array of these pixels, at this time step."""
         return EventCamera(self.pixel, time_step_s=self.time_step_s)
+
+    @property
+    def recording_error(self) -> float:
+        """Share of the light of one recording that is taken to be wrong: twice `unexplained`, 1 % at least."""
+        return max(_WORSE * self.unexplained, LEAST_ERROR)
 
     @property
     def default_distance_m(self) -> float | None:

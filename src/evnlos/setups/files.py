@@ -346,8 +346,17 @@ def same_setup(first: str, second: str) -> bool:
     return all(file.is_file() for file in files) and len({file.read_bytes() for file in files}) == 1
 
 
-def stated_setup(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
-    """Return the settings of the setup in a file, and those of a lab that were drawn from its ranges.
+class StatedSetup(NamedTuple):
+    """Settings of a setup in a file, those of a lab that were drawn from its ranges, and its targets'."""
+
+    values: dict[str, Any]
+    drawn: Mapping[str, Any]
+    glyphs: dict[str, Any] | None
+    """None where the file states none."""
+
+
+def stated_setup(path: Path) -> StatedSetup:
+    """Return the settings of the setup in a file, and what stands beside it.
 
     Args:
         path: YAML file with a setup, or with what holds one.
@@ -357,6 +366,7 @@ def stated_setup(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
     """
     values = read_yaml(path)
     drawn: Mapping[str, Any] = {}
+    glyphs = None
     if isinstance(values.get("lab"), dict):
         known = values.get("drawn")
         drawn = known if isinstance(known, dict) else {}
@@ -371,7 +381,7 @@ def stated_setup(path: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
             raise ConfigError(
                 f"{path} has no `setup`; give settings of `evnlos simulate` or `evnlos lab`, or a setup{hint}"
             )
-        values = values["setup"]
+        glyphs, values = values.get("glyphs"), values["setup"]
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: setup is {values!r}; give a mapping with the kind of the setup")
-    return values, drawn
+    return StatedSetup(values, drawn, glyphs if isinstance(glyphs, dict) else None)

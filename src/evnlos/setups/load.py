@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError, UnknownNameError
+from evnlos.scene import Glyphs
 from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup, linear_kinds
 from evnlos.setups.files import CALIBRATED_FILE, OLDER_FILE, calibrated_file, stated_setup
 from evnlos.setups.measured import MeasuredSetup
@@ -121,6 +122,13 @@ def _names() -> str:
     return f"a wall ({', '.join(_WALLS)}, with -near or -far), a room ({', '.join(ROOMS)})"
 
 
+@dataclass(frozen=True)
+class _Targets:
+    """What of the settings of a simulation says how large its targets are."""
+
+    glyphs: Glyphs
+
+
 _TOLD_BY_FOLDER = ("setup", "training", "transport", "rig", "lab", "dataset")  # a folder has one of each
 
 
@@ -177,20 +185,43 @@ def linear_setup(word: str | Path) -> Setup:
 
 
 class NamedSetup(NamedTuple):
-    """A setup, what pages and tables call it, and how a command line names it."""
+    """A setup, what pages and tables call it, how a command line names it, and the side of its targets."""
 
     setup: Setup
     name: str
     word: str
+    target_m: float | None = None
+    """As `stated_target_m` of its word, metres."""
 
 
 def named_setup(word: str | Path) -> NamedSetup:
-    """Return `load_setup(word)` with its name and with the word that stands for it in a command to repeat.
+    """Return `load_setup(word)` with its name, the word for it in a command to repeat, and its targets' side.
 
     Args:
         word: As for `load_setup`.
     """
-    return NamedSetup(load_setup(word), setup_name(word), setup_word(word))
+    return NamedSetup(load_setup(word), setup_name(word), setup_word(word), stated_target_m(word))
+
+
+def stated_target_m(word: str | Path) -> float | None:
+    """Return the side of the targets that a file states beside its setup, metres.
+
+    Those are the settings of `simulate` and `lab`, of a dataset, and the folder of a calibration.
+
+    Args:
+        word: As for `load_setup`.
+
+    Returns:
+        None for a name, a scan, and a setup alone.
+
+    Raises:
+        ConfigError: The file holds no setup, or no targets can be made of what it states.
+    """
+    path = calibrated_file(Path(word))
+    if path.suffix == SUFFIX or not path.is_file() or (glyphs := stated_setup(path).glyphs) is None:
+        return None
+    targets = from_dict(_Targets, {"glyphs": glyphs}, source=str(path), folder=path.parent)
+    return targets.glyphs.target_plane.size_m
 
 
 def is_name(word: str | Path) -> bool:
@@ -249,7 +280,7 @@ def _named(name: str) -> Setup:
 
 
 def _in_file(path: Path) -> Setup:
-    values, drawn = stated_setup(path)
+    values, drawn, _ = stated_setup(path)
     # A lab's sensor is drawn once; what was drawn stands beside the ranges.
     values = {**values, **{name: drawn[name] for name in CAMERA_FIELDS if name in drawn}}
     return from_dict(Setup, values, source=str(path), folder=path.parent)  # type: ignore[type-abstract] - its kind is concrete

@@ -38,6 +38,7 @@ from evnlos.tracking.registration import (
     temporal_noise,
 )
 from evnlos.tracking.track import (
+    FEIGNED,
     Distance,
     Measurements,
     Track,
@@ -73,7 +74,7 @@ class Tracking:
     cells: int = 20
     """With a setup: cells per side of that square."""
     depth: bool = False
-    """With a setup: also find how far the object is from the wall in each frame."""
+    """With a setup: also find how far the object is from the wall in each frame, and if that surely changes."""
     turning: bool = False
     """With a setup: also find how the object turns about the wall's normal."""
     targets: int | Literal["auto"] = 1
@@ -334,12 +335,12 @@ def _smoothed(
     distance = turn = None
     if fitted.log_distance is not None:
         log, log_sigma, rate, rate_sigma = curves[2]
-        away = (setup.default_distance_m or 1.0) * np.exp(log)
-        distance = Distance(times_s, away, away * log_sigma, away * rate, away * rate_sigma)
+        away = (own_m := setup.default_distance_m or 1.0) * np.exp(log)
+        feigned_m = FEIGNED["events" if found is None else "frames"] * setup.recording_error * own_m
+        distance = Distance(times_s, away, away * log_sigma, away * rate, away * rate_sigma, feigned_m)
     if fitted.rotation_rad is not None:
         turn = Turn(times_s, *(np.degrees(one) for one in curves[-1]))
-    image = {"image": fitted.target.numpy(), "size_m": fitted.size_m}
-    return replace(track, distance=distance, turn=turn, **image)
+    return replace(track, distance=distance, turn=turn, image=fitted.target.numpy(), size_m=fitted.size_m)
 
 
 def _instants(times_s: NDArray[np.float64], by_events: EventVelocity | None) -> NDArray[np.float64]:

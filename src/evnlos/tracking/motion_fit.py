@@ -34,15 +34,12 @@ REGION = (4.0, 2.8)
 """Sides of the part of the target's plane in which several targets are looked for, (x, y), over a target's."""
 MOST_TARGETS = 5
 """Largest number of targets that is looked for by evidence."""
-LEAST_ERROR = 0.01
-"""Share of the light that any setup is taken to get wrong; no target is told by less of it."""
 _ROUNDS, _TRIAL_ROUNDS, _STRAIGHT_ROUNDS = 24, 12, 5
 _FIRST_FRAMES, _STRIDE = 24, 3  # of which first guesses of paths are made; cells between two of them at most
 _BEND = 0.1  # what a bend of one cell costs, of the brightest score
 _STATIC, _PRIOR = 1.0, 3.0  # a pixel's constant offset over its noise; weight of the target's smoothness
 _LONGEST = 0.1  # step of a round, sides of a target
 _ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
-_WORSE = 2.0  # of one recording's share that its setup gets wrong, over that of all captures held out
 _UNTOLD = 1e-7  # share of a direction's information that the target leaves, below which it is not told
 _HELD = 1e6  # weight of the light's middle in the target's middle, over that of the frames
 
@@ -247,7 +244,7 @@ def count_targets(
 
     Args:
         light: Frames without ambient light, white levels, [N, h, w].
-        setup: The setup; e is twice its `unexplained`, as recordings differ, and 1 % at least.
+        setup: The setup; e is its `recording_error`.
         times_s: Instants of the frames, [N], seconds.
         noise: Standard deviation of a sample's noise, white levels.
         target_size_m: Side of a target plane that surely holds an object, metres.
@@ -256,7 +253,6 @@ def count_targets(
         degree: As for `fit_motion`.
     """
     found, whole = Number([], []), moving_energy(light, degree)
-    error = max(_WORSE * setup.unexplained, LEAST_ERROR)
     for number in range(1, most + 1):
         start_m = first_paths(light, setup, noise, target_size_m, number)
         bent = {"bend_m": target_size_m / 50, "degree": degree}
@@ -265,7 +261,10 @@ def count_targets(
         fewer = -0.5 * whole / sigma**2
         if found.fits:
             explained = max(whole - found.fits[-1].surprise, 0.0)
-            fewer = log_evidence(found.fits[-1], times_s, sigma) + 0.5 * error**2 * explained / sigma**2
+            fewer = (
+                log_evidence(found.fits[-1], times_s, sigma)
+                + 0.5 * setup.recording_error**2 * explained / sigma**2
+            )
         found.fits.append(fit)
         found.gains.append(log_evidence(fit, times_s, sigma) - fewer)
         if found.gains[-1] <= 0:
