@@ -126,6 +126,7 @@ WHOLE_CHAPTERS = {
     "app/views.py",
     "calibration/fit.py",
     "calibration/scan/film.py",
+    "calibration/wall_fit.py",
     "cameras/frame_camera.py",
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",

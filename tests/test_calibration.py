@@ -639,6 +639,21 @@ def test_events_that_fit_worse_leave_the_wall_and_are_warned_of(fit, tmp_path) -
         write_setup(frames, rows_of(frames, EventPixel(), FrameCamera()), tmp_path / "refused")
 
 
+def test_captures_that_do_not_fit_the_others_are_named(fit) -> None:
+    line = warnings_of(replace(fit, strays={"lab_A": 12.46, "lab_L": 7.5}))[0]
+    assert line.startswith("lab_A and lab_L: left out, what the others show leaves 12.5 and 7.5 times as much")
+    assert "check target, direction and start of their motion" in line
+
+
+def test_light_that_differs_from_capture_to_capture_stands_in_the_table(fit) -> None:
+    notes = {
+        row.name: row.note
+        for row in rows_of(replace(fit, light=((0.9, 1.0), (1.25, 1.0))), START.pixel, START.frame_camera)
+    }
+    assert notes["setup.gain"] == "0.90 to 1.25 times it from capture to capture"
+    assert notes["setup.ambient"] == ""
+
+
 def test_events_of_no_known_kind_are_warned_of(fit) -> None:
     assert fit.pixel.near
     far = replace(fit, pixel=replace(fit.pixel, near=False))

@@ -10,7 +10,7 @@ import pytest
 
 from evnlos.calibration import Calibration, CaptureSet, fit_setup, steadied, steps_table
 from evnlos.calibration.captures import grouped, wall_data
-from evnlos.calibration.wall_fit import FREEDOMS, Unknowns, WallState, normal_equations, start_at
+from evnlos.calibration.wall_fit import FREEDOMS, Unknowns, WallState, evenly_lit, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity, uneven_wall
 from evnlos.calibration.wall_search import fit_wall, travelled
 from evnlos.data import Capture, CaptureInfo
@@ -337,10 +337,56 @@ def test_ambient_light_that_changes_from_capture_to_capture_is_told_and_taken_of
     found = steadied(moved[0], moved[1], setup)
     assert found is not None
     for one, own, before in zip(found, factors, plain, strict=True):
-        assert one.ambient == pytest.approx(own, abs=0.03)
+        assert {target for target, _ in one.light} == {1.0}
+        assert [ambient for _, ambient in one.light] == pytest.approx(own, abs=0.03)
         away = one.frames().astype(float) - before.frames()
         assert abs(away.mean()) < 0.3 and np.abs(away).max() <= 1
         assert one.names == before.names
+
+
+def brightened(captures: CaptureSet, factors: list[float]) -> CaptureSet:
+    """Captures exposed for so many times as long."""
+    own = [
+        replace(one, frames=np.rint(one.frames * factor).clip(0, 255).astype(np.uint8))
+        for one, factor in zip(captures.captures, factors, strict=True)
+    ]
+    return replace(captures, captures=tuple(own))
+
+
+def test_exposures_that_differ_from_capture_to_capture_are_told_and_taken_off(rendered, fitted) -> None:
+    factors = ([0.85, 0.9, 0.95, 1.0, 1.0, 1.0, 1.05, 1.1, 1.15], [0.88, 1.0, 1.0, 1.12])
+    plain, setup = rendered[:2], fitted.optics.setup
+    moved = [brightened(one, own) for one, own in zip(plain, factors, strict=True)]
+    found = steadied(moved[0], moved[1], setup)
+    assert found is not None
+    for one, own, before in zip(found, factors, plain, strict=True):
+        assert [target for target, _ in one.light] == pytest.approx(own, abs=0.02)
+        assert [ambient for _, ambient in one.light] == pytest.approx(own, abs=0.03)
+        away = one.frames().astype(float) - before.frames()
+        assert abs(away.mean()) < 0.5 and np.abs(away).max() <= 4
+    # What is left of a second look adds up with the first.
+    again = [brightened(one, [1.1] + [1.0] * (len(one.captures) - 1)) for one in found]
+    twice = steadied(again[0], again[1], setup)
+    assert twice is not None
+    for one, own in zip(twice, factors, strict=True):
+        assert one.light[0] == pytest.approx((1.1 * own[0], 1.1 * own[0]), abs=0.03)
+
+
+def test_a_search_tells_how_bright_each_target_is_beside_the_wall(rendered, fitted) -> None:
+    """Also with steps in exposure that are as large as the differences between targets."""
+    factors = [0.85, 0.9, 0.95, 1.0, 1.0, 1.0, 1.05, 1.1, 1.15]
+    moved = replace(brightened(rendered[0], factors), drifts=True)
+    data = wall_data(moved, 48, PLANE)
+    own = fitted.search.state.gains(data)[np.searchsorted(data.capture, np.arange(9))]
+    assert own / own.mean() == pytest.approx(np.array(factors) / np.mean(factors), abs=0.02)
+    assert (fitted.search.state.gains(replace(data, drifts=False)) == 1).all()
+    levelled = evenly_lit(moved, fitted.search.state, PLANE)
+    away = levelled.frames() / np.mean(factors) - rendered[0].frames()
+    assert np.abs(away.mean(axis=(1, 2))).max() < 1
+    # What the captures of a wall leave without it is far more.
+    state = fitted.search.state
+    fixed = np.square(state.residual(replace(data, drifts=False))).sum()
+    assert np.square(state.residual(data)).sum() < 0.3 * fixed
 
 
 def test_what_a_fit_sees_of_drifting_captures_is_what_it_sees_of_steady_ones(rendered) -> None:

@@ -109,13 +109,13 @@ class CaptureSet:
     Args:
         captures: The captures; the motion of each is known, and, where they are `labelled`, the target.
         target_size_m: Side of the targets, metres.
-        ambient: Ambient light of each over the setup's, which its frames no longer show; () is 1.
-        drifts: Whether the ambient light of each counts as unknown.
+        light: Target and ambient light of each over the setup's, which its frames no longer show; () is 1.
+        drifts: Whether target and ambient light of each count as unknown.
     """
 
     captures: tuple[Capture, ...]
     target_size_m: float = 0.08
-    ambient: tuple[float, ...] = ()
+    light: tuple[tuple[float, float], ...] = ()
     drifts: bool = False
 
     @property

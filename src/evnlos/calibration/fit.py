@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -40,9 +40,12 @@ _WITHOUT_PATTERN = "frames held out, without pattern"
 _MOST_OF_NOISE = 1.1
 _MOST_UNEXPLAINED = {"known": 0.05, "unknown": 0.2}  # targets that nobody knows are never expected exactly
 
-_COARSER, _EVERY = 4, 2  # pixels and frames of one that the ambient light of captures is told from
-_LEAST_CHANGE, _LEAST_CHANGE_DN = 0.02, 0.1  # of ambient light from capture to capture: of itself; DN of 8 bits
+_COARSER, _EVERY = 4, 2  # pixels and frames of one that the light of captures is told from
+_LEAST_CHANGE, _LEAST_CHANGE_DN = 0.02, 0.1  # of light from capture to capture: of itself; DN of 8 bits
 _STEADIER = 0.9  # of what is left that another fit has to reach
+_MOST_STEADYING = 3  # fits of captures that were steadied: each tells their light better
+_DOUBTFUL, _STRAY = 2.0, 3.0  # times what captures keep in the median: with the capture in the fit, without it
+_MOST_STRAYS = 0.25  # of all captures: where more do not fit, the fit is wrong
 
 Surfaces = dict[str, tuple[NDArray, NDArray]]
 """Time surfaces [N, 2, h, w] of camera and model by capture."""
@@ -111,7 +114,8 @@ class SetupFit:
         ink: Where the known targets have their ink.
         shown: What one frame shows of a target, whatever the method; None where that is not known.
         curved: What `curvature` says of the frames held out; zeros where it can only be the wall's.
-        ambient: Ambient light of each capture over the setup's; () where it is the same in all.
+        light: Target and ambient light of each capture over the setup's; () where they are the same in all.
+        strays: What captures that were left out keep, over the median of all: they do not fit the others.
     """
 
     simulation: Simulation
@@ -130,13 +134,23 @@ class SetupFit:
     ink: Ink = field(default_factory=Ink)
     shown: Shown | None = None
     curved: tuple[float, float] = (0.0, 0.0)
-    ambient: tuple[float, ...] = ()
+    light: tuple[tuple[float, float], ...] = ()
+    strays: dict[str, float] = field(default_factory=dict)
 
     @property
-    def ambient_words(self) -> str:
-        """How the ambient light differs from capture to capture; empty where it does not."""
-        own = self.ambient
-        return f"{min(own):.2f} to {max(own):.2f} times it from capture to capture" if own else ""
+    def stray_words(self) -> list[str]:
+        """Which captures were left out because they do not fit the others, a line; none where all do."""
+        if not self.strays:
+            return []
+        names, kept = " and ".join(self.strays), " and ".join(f"{k:.1f}" for k in self.strays.values())
+        what = f"{names}: left out, what the others show leaves {kept} times as much of them as of most"
+        return [f"{what}; check target, direction and start of their motion, and whether the camera moved"]
+
+    @property
+    def light_words(self) -> tuple[str, str]:
+        """How target and ambient light differ from capture to capture; empty where they do not."""
+        gain, ambient = (_range_words(own) for own in zip(*self.light, strict=True)) if self.light else ("", "")
+        return gain, ambient
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -169,6 +183,12 @@ class SetupFit:
         if not self.residuals["frames held out"].after < self.mean_frame and "frames held out" not in found:
             found.append("frames held out")
         return tuple(found)
+
+
+def _range_words(own: Sequence[float]) -> str:
+    """Return how factors of captures differ; empty where they do not."""
+    low, high = min(own), max(own)
+    return f"{low:.2f} to {high:.2f} times it from capture to capture" if high > low else ""
 
 
 def fit_setup(
@@ -214,7 +234,7 @@ def fit_setup(
     if settings.events and alone:
         raise DataError(f"{alone[0]} holds frames alone, no events; fit the frames alone (--no-events)")
     start, fixed = _at_known_distance(settings, fit)
-    residuals: dict[str, Residual] = {}
+    residuals, strays = dict[str, Residual](), dict[str, float]()
     is_any = start.wall_start() is not None and _is_any(settings, fit)
     if settings.measured and not is_any:
         raise ConfigError(
@@ -223,7 +243,7 @@ def fit_setup(
         )
     begin(1)
     if is_any:
-        optics, fit, held = _fit_any(settings, fit, held, start)
+        optics, fit, held, strays = _fit_any(settings, fit, held, start)
     elif settings.targets == "known":
         optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     else:
@@ -273,7 +293,7 @@ def fit_setup(
         seen_targets = [*zip(fit.names, fit.scenes, strict=True), *zip(held.names, held.scenes, strict=True)]
         side = simulation.glyphs.target_plane.size_m
         known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
-    training = training_simulation(simulation, noise, pixel, shown, (*fit.ambient, *held.ambient))
+    training = training_simulation(simulation, noise, pixel, shown, (*fit.light, *held.light))
     return SetupFit(
         simulation,
         training,
@@ -291,15 +311,16 @@ def fit_setup(
         Ink.of(shown),
         Shown.by(simulation),
         curved if curved[0] < 0 or about.tone or about.log else (0.0, 0.0),  # else it is the wall's
-        (*fit.ambient, *held.ambient),
+        (*fit.light, *held.light),
+        strays,
     )
 
 
 def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSet, CaptureSet] | None:
-    """Return captures without what the ambient light of each has more or less than the setup's.
+    """Return captures without what the light of each has more or less than the setup's.
 
-    Daylight, and lamps elsewhere in the room, change from one recording to the next; what is fitted takes it to
-    be the same in all.
+    Daylight, lamps elsewhere in the room, the lamp of the target and the exposure change from one recording to
+    the next; what is fitted takes them to be the same in all.
 
     Args:
         fit: Captures that were fitted.
@@ -309,52 +330,116 @@ def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSe
     Returns:
         The same captures; None where they do not differ by what frames show.
     """
-    factors, around = _ambient_changes(fit, held, setup), setup.ambient_light(fit.shape).numpy()
+    factors = _light_changes(fit, held, setup)
     if factors is None:
         return None
-    middle, found = float(np.median(np.concatenate(factors))), list[CaptureSet]()
+    around, found = setup.ambient_light(fit.shape).numpy(), list[CaptureSet]()
+    middle = np.median(np.concatenate(factors), axis=0)  # of target and ambient light
     for one, own in zip((fit, held), factors, strict=True):
-        parts, captures = (np.array(own) / middle).clip(0), []
-        for capture, part in zip(one.captures, parts.tolist(), strict=True):
-            less = np.rint(capture.frames - np.float32((part - 1) * middle * one.peak) * around)
-            frames = less.clip(0, one.peak).astype(capture.frames.dtype)
+        parts, captures = (own / middle).clip(0), []
+        for capture, (target, ambient) in zip(one.captures, parts.tolist(), strict=True):
+            usual = np.float32(middle[1] * one.peak) * around
+            level = (capture.frames - np.float32(ambient) * usual) / np.float32(target) + usual
+            frames = np.rint(level).clip(0, one.peak).astype(capture.frames.dtype)
             captures.append(replace(capture, frames=np.where(capture.frames >= one.peak, one.peak, frames)))
-        found.append(replace(one, captures=tuple(captures), ambient=tuple(parts.tolist())))
+        before = np.array(one.light or [(1.0, 1.0)] * len(parts))
+        light = before * parts
+        light[:, 1] = before[:, 1] + before[:, 0] * (parts[:, 1] - 1)
+        found.append(replace(one, captures=tuple(captures), light=tuple(map(tuple, light.tolist()))))
     return found[0], found[1]
 
 
-def _ambient_changes(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[tuple[float, ...]] | None:
-    """Return the ambient light of each capture over the setup's; None where frames do not show a change."""
-    low = (max(8, round(fit.shape[0] / _COARSER)), max(8, round(fit.shape[1] / _COARSER)))
-    factors = [FrameModel(one, low, _EVERY).ambient_factors(setup) for one in (fit, held)]
-    every, level = np.concatenate(factors), float(setup.ambient_light(fit.shape).mean())
-    spread, middle = float(every.std()), float(np.median(every))
-    is_seen = spread > _LEAST_CHANGE and spread * level * 255 > _LEAST_CHANGE_DN and middle > 0
-    return factors if is_seen else None
+def _low(captures: CaptureSet) -> tuple[int, int]:
+    """Return the size (h, w) at which captures are told from each other."""
+    height, width = captures.shape
+    return max(8, round(height / _COARSER)), max(8, round(width / _COARSER))
+
+
+def _light_changes(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[NDArray[np.float64]] | None:
+    """Return target and ambient light [captures, 2] over the setup's; None where frames show no change.
+
+    Of what does not change by more than they show, all captures have the median.
+    """
+    factors = [FrameModel(one, _low(fit), _EVERY).light_factors(setup) for one in (fit, held)]
+    every = np.concatenate(factors)
+    levels = np.array([setup.gain, float(setup.ambient_light(fit.shape).mean())])
+    spread, middle = every.std(axis=0), np.median(every, axis=0)
+    is_seen = (spread > _LEAST_CHANGE) & (spread * levels * 255 > _LEAST_CHANGE_DN) & (middle > 0)
+    if not is_seen.any() or not (every[:, 0] > 0).all():
+        return None
+    return [np.where(is_seen, one, middle) for one in factors]
 
 
 def _fit_any(
     settings: Calibration, fit: CaptureSet, held: CaptureSet, start: Setup
-) -> tuple[TransportFit, CaptureSet, CaptureSet]:
-    """Return the fit of a wall of any kind, and the captures behind it, `steadied` where that helps."""
+) -> tuple[TransportFit, CaptureSet, CaptureSet, dict[str, float]]:
+    """Return the fit of a wall of any kind, the captures behind it, and those that do not fit the others.
+
+    The captures are `steadied` where that helps. A capture of a wrong target or motion spoils the fit of all:
+    one that keeps much more than the others is left out where it does so behind the fit of these, too. It comes
+    with what it keeps over the median.
+    """
 
     def wall(one: CaptureSet, other: CaptureSet) -> TransportFit:
         how = {"fit_distance": settings.fit_distance, "measured": settings.measured}
         return fit_wall(one, other, start, **how).optics
 
-    def left(other: CaptureSet, setup: Setup) -> float:
-        model = FrameModel(other, other.shape, _EVERY)
-        return model.left(model.predict(setup))
+    def is_better(other: CaptureSet, setup: Setup) -> bool:
+        after, before = (
+            model.left(model.predict(by))
+            for model, by in (
+                (FrameModel(other, other.shape, _EVERY), setup),
+                (FrameModel(held, held.shape, _EVERY), optics.setup),
+            )
+        )
+        return after < _STEADIER * before
 
-    optics = wall(fit, held)
-    if _ambient_changes(fit, held, optics.setup) is None:
-        return optics, fit, held
-    note("ambient light that differs from capture to capture")
-    there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
-    steady = steadied(fit, held, there) or (fit, held)
-    again = wall(*steady)
-    is_better = left(steady[1], again.setup) < _STEADIER * left(held, optics.setup)
-    return (again, *steady) if is_better else (optics, fit, held)
+    optics, recorded = wall(fit, held), (fit, held)
+    if _light_changes(fit, held, optics.setup) is not None:
+        note("light that differs from capture to capture")
+        there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
+        steady, again = recorded, optics
+        for _ in range(_MOST_STEADYING):
+            steadier = steadied(*steady, there)
+            if steadier is None:
+                break
+            steady, again = steadier, wall(*steadier)
+            there = again.setup
+        if is_better(steady[1], there):
+            optics, (fit, held) = again, steady
+    doubtful = [name for name, kept in _kept(fit, held, optics.setup).items() if kept > _DOUBTFUL]
+    fewer = _without(fit, doubtful), _without(held, doubtful)
+    most = _MOST_STRAYS * (len(fit.captures) + len(held.captures))
+    if not 0 < len(doubtful) <= most or len(fewer[0].captures) < _FEWEST_FOR_ANY or not fewer[1].captures:
+        return optics, fit, held, {}
+    note(f"without {' and '.join(doubtful)}, which the others do not explain")
+    again = wall(*fewer)
+    strays = {name: kept for name, kept in _kept(fit, held, again.setup).items() if kept > _STRAY}
+    if not strays:
+        return optics, fit, held, {}
+    if fit.light:  # it was told with strays among the captures
+        fit, held = (_without(one, strays) for one in recorded)
+        optics, fit, held, more = _fit_any(settings, fit, held, start)
+        return optics, fit, held, strays | more
+    return again, _without(fit, strays), _without(held, strays), strays
+
+
+def _kept(captures: CaptureSet, others: CaptureSet, setup: Setup) -> dict[str, float]:
+    """Return what a fit leaves of each capture, over the median of all."""
+    kept = dict[str, float]()
+    for one in (captures, others):
+        model, of = FrameModel(one, _low(one), _EVERY), one.frame_of(_EVERY)
+        squares = ((model.frames - model.predict(setup)) * model.weight).square().mean(dim=(1, 2)).numpy()
+        kept |= {name: math.sqrt(squares[of == k].mean()) for k, name in enumerate(one.names)}
+    middle = float(np.median(list(kept.values())))
+    return {name: value / middle for name, value in kept.items()}
+
+
+def _without(captures: CaptureSet, names: Collection[str]) -> CaptureSet:
+    """Return the captures but some."""
+    stay = [k for k, name in enumerate(captures.names) if name not in names]
+    light = tuple(captures.light[k] for k in stay) if captures.light else ()
+    return replace(captures, captures=tuple(captures.captures[k] for k in stay), light=light)
 
 
 def _is_any(settings: Calibration, fit: CaptureSet) -> bool:
@@ -443,7 +528,7 @@ def training_simulation(
     noise: FrameNoise,
     pixel: PixelFit | None,
     shown: Sequence[Target],
-    ambient: Sequence[float] = (),
+    light: Sequence[tuple[float, float]] = (),
 ) -> Simulation:
     """Return the simulation to pre-train on: the fitted one, varied from object to object.
 
@@ -455,15 +540,15 @@ def training_simulation(
         noise: The frame camera's noise.
         pixel: The fitted event pixel; None where only frames were fitted.
         shown: The known targets; none where they are unknown.
-        ambient: Ambient light of the captures over the fitted one.
+        light: Target and ambient light of the captures over the fitted ones.
     """
     glyphs = fitted.glyphs
     if isinstance(glyphs, HandwritingGlyphs):
         glyphs = written_alike(replace(glyphs, strokes=Strokes("both")), shown)
     vary = fitted.vary | ranges_around(fitted, _SPREAD)
-    if ambient:
-        low, high = vary["setup.ambient"]
-        vary["setup.ambient"] = (low * min(1.0, *ambient), high * max(1.0, *ambient))
+    for name, own in zip(("setup.gain", "setup.ambient"), zip(*light, strict=True), strict=False):
+        low, high = vary[name]
+        vary[name] = (low * min(1.0, *own), high * max(1.0, *own))
     for one in fitted.setup.parameters():
         if one.role == "place":
             vary[f"setup.{one.name}"] = (one.value - _SLACK_M, one.value + _SLACK_M)

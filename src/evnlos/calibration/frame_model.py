@@ -123,16 +123,16 @@ class FrameModel:
         """Return the frames that the setup, with its own gain and ambient light, predicts, [N, h, w]."""
         return setup.gain * self.light(setup) + setup.ambient_light(self.shape)
 
-    def ambient_factors(self, setup: Setup) -> tuple[float, ...]:
-        """Return the ambient light of each capture over the setup's: least squares beside its own gain."""
+    def light_factors(self, setup: Setup) -> NDArray[np.float64]:
+        """Return target and ambient light of each capture over the setup's, [captures, 2], by least squares."""
         around, counts, found = setup.ambient_light(self.shape), [len(one) for one in self._times], []
         parts = (self.light(setup).split(counts), self.frames.split(counts), self.weight.split(counts))
         for light, seen, weight in zip(*parts, strict=True):
-            both = torch.stack([light, around.to(light).expand_as(light)]).double()
+            both = torch.stack([setup.gain * light, around.to(light).expand_as(light)]).double()
             normal = torch.einsum("anhw,bnhw,nhw->ab", both, both, weight.double())
             right = torch.einsum("anhw,nhw,nhw->a", both, seen.double(), weight.double())
-            found.append(float(torch.linalg.lstsq(normal, right[:, None]).solution[1]))
-        return tuple(found)
+            found.append(torch.linalg.lstsq(normal, right[:, None]).solution[:, 0].numpy())
+        return np.stack(found)
 
     def _along(self, setup: Setup) -> torch.Tensor | float:
         """Return the light of what moves along with the targets, [N, h, w], or nothing."""

@@ -63,10 +63,10 @@ def rows_of(fit: SetupFit, start_pixel: Any, start_camera: Any) -> list[Row]:
         Row(f"setup.{p.name}", start[p.name], end[p.name], float(e), p.unit, bound.get(p.name, ""))
         for p, e in zip(optics.parameters, optics.error, strict=True)
     ]
-    gain = _UNTOLD if fit.targets == "unknown" else ""
+    gain, ambient = (_UNTOLD, "") if fit.targets == "unknown" else fit.light_words
     rows += [
         Row("setup.gain", first.gain, last.gain, None, "white levels", gain),
-        Row("setup.ambient", first.ambient, last.ambient, None, "white levels", fit.ambient_words),
+        Row("setup.ambient", first.ambient, last.ambient, None, "white levels", ambient),
     ]
     rows += [
         Row(f"setup.ambient_gradient.{k}", first.ambient_gradient[k], last.ambient_gradient[k], None, "")
@@ -129,7 +129,7 @@ def warnings_of(fit: SetupFit) -> list[str]:
     Args:
         fit: The calibration.
     """
-    found, cure = [], f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
+    found, cure = fit.stray_words, f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
     if on_bound := fit.optics.on_bound:
         names = ", ".join(f"setup.{name} ({value:.4g})" for name, value in on_bound.items())
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")

@@ -2,9 +2,9 @@
 
 The frames are y(p, n) = shared(p, place of n) + g(p) sum_q A(p, q; pose, slopes) x(q, n), with x the known
 images. What all captures share at a place is taken off both sides: ambient light, and anything else that
-moves along. The rest is least squares in the numbers of the pose, the logarithm of the slopes' density, a
-polynomial for the sensitivity g and a matte part, all at once (Gauss-Newton with damping; Marquardt 1963), with
-priors.
+moves along. Where light drifts, the brightness of each capture's target is free. The rest is least squares
+in the numbers of the pose, the logarithm of the slopes' density, a polynomial for the sensitivity g and a matte
+part, all at once (Gauss-Newton with damping; Marquardt 1963), with priors.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Array, WallData
+from evnlos.calibration.captures import Array, CaptureSet, WallData, wall_data
 from evnlos.calibration.transport_fit import BLOCKS, scatter_of
 from evnlos.errors import ConfigError
 from evnlos.machine import note
@@ -36,6 +36,7 @@ from evnlos.optics.facets import (
     target_cells,
 )
 from evnlos.optics.radiometric import torchs_threads
+from evnlos.types import Plane
 
 LOBES = np.array(
     [(a, a * r) for a in (0.02, 0.035, 0.06, 0.10, 0.17, 0.3) for r in (0.6, 1.0, 1.6)], dtype=np.float64
@@ -49,6 +50,7 @@ _TILT = 0.15  # of the coefficients of the sensitivity's polynomial
 _MATTE = 10.0  # of the matte part, in units that count beside the facets
 _CHUNK = 400  # pixels whose derivatives are held at a time
 _TRIALS = 6
+_DIMMEST_BRIGHTEST = (0.2, 5.0)  # targets of captures beside the mean of all
 _TOLERANCE = 1e-3  # a search ends when a step lowers its cost by a smaller fraction
 
 
@@ -143,9 +145,25 @@ class WallState:
             carry_facets(out, *self.place(data, pose, tilt), self.table, MASKING, data.images)
         return out * np.exp(data.monomials() @ self.sensitivity)[:, None]
 
+    def gains(self, data: WallData, light: Array | None = None) -> Array:
+        """Return how bright the target of each frame is beside the mean of all, [N]; 1 where no light drifts.
+
+        Least squares over the captures, whose mean is taken off together as it is from what they show.
+        """
+        if not data.drifts:
+            return np.ones(data.seen.shape[1])
+        light = self.light(data) if light is None else light
+        member, root = _members(data.capture), np.sqrt(data.weight)[:, None]
+        own = np.stack([(data.shared_removed(light * one) * root).ravel() for one in member.T])
+        found = np.linalg.lstsq(own @ own.T, own @ (data.shared_removed(data.seen) * root).ravel(), rcond=None)[
+            0
+        ]
+        return member @ (found / found.mean()).clip(*_DIMMEST_BRIGHTEST)
+
     def residual(self, data: WallData) -> Array:
         """Return the weighted residual [P, N] without what the captures share."""
-        left = data.shared_removed(data.seen - self.light(data))
+        light = self.light(data)
+        left = data.shared_removed(data.seen - light * self.gains(data, light))
         return left * np.sqrt(data.weight)[:, None]
 
 
@@ -255,6 +273,24 @@ class Unknowns:
         return total / np.bincount(self.column.ravel(), minlength=self.count)
 
 
+def evenly_lit(captures: CaptureSet, state: WallState, plane: Plane) -> CaptureSet:
+    """Return captures whose light drifts with targets of the same brightness in all; others as they are.
+
+    Args:
+        captures: The captures.
+        state: Behind which their brightness is told.
+        plane: Cells of the targets' images.
+    """
+    if not captures.drifts:
+        return captures
+    data, frames = wall_data(captures, 25, plane, every=8), []
+    own = state.gains(data)[np.unique(data.capture, return_index=True)[1]]
+    for one, gain in zip(captures.captures, own.tolist(), strict=True):
+        level = np.rint(one.frames / np.float32(gain)).clip(0, captures.peak).astype(one.frames.dtype)
+        frames.append(replace(one, frames=np.where(one.frames >= captures.peak, one.frames, level)))
+    return replace(captures, captures=tuple(frames))
+
+
 def refine(
     data: WallData,
     state: WallState,
@@ -350,7 +386,7 @@ def normal_equations(
             moves.append((light - state.light(data, freedom.moved(state.pose, -freedom.step))) / freedom.step)
     seen, cells = state.place(data)
     monomials, root = data.monomials(), np.sqrt(data.weight).astype(np.float32)
-    gain = np.exp(monomials @ state.sensitivity)
+    gain, bright = np.exp(monomials @ state.sensitivity), state.gains(data, light).astype(np.float32)
     gram, right = np.zeros((unknowns.size, unknowns.size)), np.zeros(unknowns.size)
     member = _members(data.group) / np.sqrt(np.bincount(data.group)).astype(np.float32)  # [N, G]
     capture = torch.from_numpy(_members(data.capture))
@@ -366,7 +402,7 @@ def normal_equations(
         jac[..., poses : poses + count] = slopes[..., :-1] * gain[part, None, None]
         jac[..., poses + count : -1] = own[..., None] * monomials[part, None, :]
         jac[..., -1] = slopes[..., -1] * (gain[part, None] * unknowns.matte)
-        jac *= root[part, None, None]
+        jac *= root[part, None, None] * bright[:, None]
         every = torch.from_numpy(jac)
         left = torch.from_numpy(now[part].astype(np.float32))
         flat = every.flatten(0, 1)

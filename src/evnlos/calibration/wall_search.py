@@ -28,6 +28,7 @@ from evnlos.calibration.wall_fit import (
     Freedom,
     Progress,
     WallState,
+    evenly_lit,
     refine,
     start_at,
     uncertainty,
@@ -224,6 +225,7 @@ def fit_wall(
     known, freedoms = with_measured(known, freedoms, measured or {})
     plane = travelled(fit, held, _SEARCH_CELL_M)
     search = search_wall(fit, known, freedoms, plane, columns=columns)
+    fit, held = (evenly_lit(one, search.state, plane) for one in (fit, held))
     rest = rest_of(fit, held, search.state, plane)
     folder = Path(tempfile.mkdtemp(prefix="evnlos-wall-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # the setup is read from it until it is saved

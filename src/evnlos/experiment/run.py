@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
+from evnlos.calibration import CALIBRATION_VALUES_FILE, SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, as_modality, import_captures, load_pattern, simulate
 from evnlos.data.pool import processes, run_tasks, workers_kept
@@ -131,19 +132,20 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
             fit = fit_setup(place.captures, how, progress)
             write_setup(fit, rows_of(fit, how.start.pixel, how.start.frame_camera), setup)
             _draw(fit, setup / "check.png")
-            if sees_events and any(arm.sampling.is_solved for arm in arms):
-                from evnlos.calibration import write_event_errors  # which takes a help text longer to show
-
-                write_event_errors(setup, place.captures, fit.captures, progress, place.workers)
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
+    from evnlos.calibration import write_event_errors  # these two take a help text longer to show
+    from evnlos.inverse import EVENT_ERRORS_FILE, gains_by_errors
+
+    solves = sees_events and any(arm.sampling.is_solved for arm in arms)
+    if needs_setup and solves and not (setup / EVENT_ERRORS_FILE).is_file():
+        saw = json.loads((setup / CALIBRATION_VALUES_FILE).read_text())  # maybe another study's
+        write_event_errors(setup, place.captures, saw["fitted"] + saw["held_out"], progress, place.workers)
     if needs_setup:  # the canvas is that of its targets and their way
         found, usual = load_yaml(Simulation, calibrated_file(setup)), study.calibration.start
         arms = tuple(arm.enlarged(found.sampling.pitch_m / usual.sampling.pitch_m) for arm in arms)
     study = replace(study, arms=arms)
-    from evnlos.inverse import gains_by_errors  # which compiles
-
     networks = list[_Network]()
     for arm in study.arms:
         recorded = (_import(study, arm, place, progress),)

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -324,7 +325,7 @@ class FrameOperator:
 
     def __init__(self, setup: Setup, sampling: Sampling) -> None:
         self.size = (sampling.height, sampling.width)
-        self.matrix, source = _matrix(setup, sampling)
+        self.matrix, source = _matrix(setup, self.size, sampling.pitch_m)
         self.ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), self.size)).flatten()
         first = (sampling.height - source.height) // 2
         self.rows = slice(first, first + source.height)
@@ -342,15 +343,16 @@ class FrameOperator:
         return self._camera.noise_variance(level) / self._pixels
 
 
-def _matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
+@lru_cache(maxsize=2)  # the networks of a setup ask one after the other
+def _matrix(setup: Setup, size: tuple[int, int], pitch_m: float) -> tuple[Tensor, Plane]:
     """Return the matrix from canvas cells to sample pixels, and the cells: rows that the target reaches."""
-    cells, height = setup.target_cells(), sampling.height
+    cells, height = setup.target_cells(), size[0]
     if cells is not None:
-        height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
-    plane = Plane(height, sampling.width, sampling.pitch_m)
+        height = min(height, 2 * round(cells.extent_m[0] / pitch_m / 2))
+    plane = Plane(height, size[1], pitch_m)
     matrix = setup.operator(plane, dtype=torch.float32).dense(torch.float32)
     images = matrix.T.reshape(-1, *setup.shape).numpy()
-    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
+    small = reduce_by_area(images, size).reshape(len(images), -1)
     return torch.from_numpy(small).T.contiguous(), plane
 
 
