@@ -2,7 +2,8 @@
 
 - What the package can't work without, and how an installation gets it back; needs none of it itself.
 - Is this installation whole? Each part, what was found, and what to do where it is missing.
-- A command described without the libraries that its work needs, so that help comes at once.
+- A command described without the libraries that its work needs, so that help comes at once; what is said where
+  these take long to load.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ import re
 import shutil
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from evnlos.errors import EvnlosError
+from evnlos.machine import ProgressBars, Step
 from evnlos.registry import __version__
 
 REQUIRED = {
@@ -405,6 +408,29 @@ def without_work_libraries() -> Iterator[None]:
         for name, names in kept.items():  # a package holds its modules as attributes, too
             for added in set(vars(sys.modules[name])) - set(names):
                 delattr(sys.modules[name], added)
+
+
+@contextlib.contextmanager
+def told_while_loading(after_s: float | None = None) -> Iterator[None]:
+    """Show progress while libraries are imported, where that takes long.
+
+    Args:
+        after_s: How long no progress begins, seconds. None: four on a terminal, where a bar shows at once and
+            most starts need none; else half of one, since lines wait by themselves.
+    """
+    if after_s is None:
+        after_s = 4.0 if hasattr(sys.stderr, "isatty") and sys.stderr.isatty() else 0.5
+    what, within = "start", "loading PyTorch and other libraries"
+    with ProgressBars() as progress:
+        later = threading.Timer(after_s, progress, [Step(what, 0, 1, "stages", within=within)])
+        later.daemon = True
+        later.start()
+        try:
+            yield
+        finally:
+            later.cancel()
+            later.join()
+        progress(Step(what, 1, 1, "stages"))
 
 
 def _bare_dataclass(usual: Any) -> Any:

@@ -23,6 +23,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TextIO, cast
 
+from evnlos import doctor
 from evnlos.cli.parsing import (
     FLAG,
     LEVELS,
@@ -38,13 +39,11 @@ from evnlos.cli.parsing import (
     parse,
     todays_words,
 )
-from evnlos.doctor import WORK_LIBRARIES, examine, fault_behind, without_work_libraries
 from evnlos.errors import ConfigError, EvnlosError, PlainOutput, UnknownNameError, for_command_line, printable
 from evnlos.machine import PROGRESS, SHOWN, sleep_while_waiting
 from evnlos.registry import Kinded, __version__, kind_of
 
 # Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
-
 
 VERBS: dict[str, str] = {
     "demo": "experiment.DemoCommand",
@@ -124,7 +123,7 @@ def main(argv: list[str] | None = None) -> None:
         if isinstance(error, EvnlosError):
             print(f"evnlos {verb}: error: {for_command_line(error)}", file=sys.stderr)
             sys.exit(2)
-        fault = fault_behind(error)
+        fault = doctor.fault_behind(error)
         if fault is not None:
             text = f"{fault.name} is {fault.found}; {fault.cure} (evnlos doctor looks at all that is needed)"
         elif isinstance(error, MemoryError):
@@ -260,11 +259,11 @@ def _answer_at_once(verb: str, rest: list[str]) -> Any:
         UnknownNameError: A name stands for nothing.
         SystemExit: Help was asked for, and printed.
     """
-    if verb == "doctor" or set(WORK_LIBRARIES) & set(sys.modules) or threading.active_count() > 1:
+    if verb == "doctor" or set(doctor.WORK_LIBRARIES) & set(sys.modules) or threading.active_count() > 1:
         return None
     refusal = light = None
     try:
-        with without_work_libraries():
+        with doctor.without_work_libraries():
             command = command_of(verb)
             if hasattr(command, "PRESETS") and any(_DECIDES.match(word) for word in rest):
                 check_names(rest)
@@ -307,7 +306,8 @@ def _command(verb: str, rest: list[str]) -> Any:
     Raises:
         ConfigError: A word does not fit, or the result could not be written, before it is worked for.
     """
-    command = command_of(verb)
+    with doctor.told_while_loading():
+        command = command_of(verb)
     if verb == "doctor" and set(rest) <= {"--json"}:  # the parser itself may be what is missing
         return command(json="--json" in rest)
     made = parse(command, rest, verb, _defaults(command, rest))
@@ -389,7 +389,7 @@ class DoctorCommand:
 
     def run(self) -> None:
         """Print each part; exit code 1 where a needed one is broken."""
-        parts = examine()
+        parts = doctor.examine()
         if self.json:
             print(json.dumps({"parts": [asdict(part) for part in parts]}))
         else:
