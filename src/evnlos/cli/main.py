@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TextIO, cast
@@ -311,9 +312,9 @@ def _command(verb: str, rest: list[str]) -> Any:
     if verb == "doctor" and set(rest) <= {"--json"}:  # the parser itself may be what is missing
         return command(json="--json" in rest)
     made = parse(command, rest, verb, _defaults(command, rest))
-    for one in (made, getattr(made, "settings", None)):
-        if isinstance(out := getattr(one, "out", None), Path) and not getattr(made, "dry_run", False):
-            kind, force = type(one).__annotations__.get("out", ""), getattr(made, "force", False)
+    for one, name in product((made, getattr(made, "settings", None)), ("out", "half", "preview")):
+        if isinstance(out := getattr(one, name, None), Path) and not getattr(made, "dry_run", False):
+            kind, force = type(one).__annotations__.get(name, ""), getattr(made, "force", False)
             check_out(out, kind, force, _BESIDE.get(verb, ()))
     return made
 
@@ -334,12 +335,8 @@ def _defaults(command: type[Any], rest: list[str]) -> Any:
         if word is not None and hasattr(command, f"with_{name}"):
             settings = getattr(command, f"with_{name}")(settings, word)
     settings = _of_kinds(settings, rest)
-    required = {
-        item.name: tyro.MISSING
-        for item in fields(command)
-        if item.default is MISSING and item.default_factory is MISSING
-    }
-    return command(**required | {"settings": settings})
+    bare = (item for item in fields(command) if item.default is MISSING and item.default_factory is MISSING)
+    return command(**{item.name: tyro.MISSING for item in bare} | {"settings": settings})
 
 
 def _preset(command: type[Any], rest: list[str]) -> Any:
