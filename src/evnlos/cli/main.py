@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import ast
 import difflib
 import importlib
 import json
@@ -235,10 +234,8 @@ def summary_of(verb: str) -> str:
     """Return the first line of a command's description, without importing what the command needs."""
     module, _, name = VERBS[verb].partition(".")
     source = (files("evnlos.cli") / f"{module}.py").read_text(encoding="utf-8")
-    command = next(
-        node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name
-    )
-    return (ast.get_docstring(command) or "").partition("\n")[0]
+    found = re.search(rf'^class {name}\b.*:\n    """(.*?)(?:"""|\n)', source, re.MULTILINE)
+    return found[1] if found else ""
 
 
 def _unknown(verb: str) -> str:
