@@ -135,6 +135,7 @@ WHOLE_CHAPTERS = {
     "data/simulate.py",
     "events/batch.py",
     "events/files/aedat.py",
+    "doctor.py",
     "experiment/conditions.py",
     "inverse/corner.py",
     "inverse/event_images.py",

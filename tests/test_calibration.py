@@ -228,7 +228,7 @@ def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
     looked, steps = [], []
     fit = evnlos.calibrate(folders, tmp_path / "python", settings, look=looked.append, progress=steps.append)
     assert looked == [fit] and (fit.simulation, fit.held_out) == (setup, ("lab_4",))
-    assert [step.done for step in steps] == [0, 1, 2, 3]
+    assert [step.done for step in steps] == [0, 1, 2, 3, 4] and steps[3].within.endswith("what the wall shows")
     for name in ("setup.yaml", "training.yaml", "calibration.json", "pattern.safetensors"):
         assert (tmp_path / "python" / name).read_bytes() == (out / name).read_bytes(), name
 

@@ -304,8 +304,9 @@ def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None
     with pytest.raises(DataError, match="0 x 480"):
         begin_capture(tmp_path / "other", 0, 480)
     (tmp_path / "file").touch()
-    with pytest.raises(DataError, match="is a file"):
-        begin_capture(tmp_path / "file", 640, 480)
+    for folder in ("file", "file/recording"):
+        with pytest.raises(DataError, match="file is a file; give a folder"):
+            begin_capture(tmp_path / folder, 640, 480)
 
 
 @pytest.mark.parametrize("name", CAMERAS)

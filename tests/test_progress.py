@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from evnlos import doctor
 from evnlos.analysis import AnalysisSettings, evaluate, identify
 from evnlos.calibration.transport_fit import levenberg_marquardt
 from evnlos.cli import main
@@ -109,6 +110,15 @@ def test_a_stage_that_says_nothing_itself_moves(capsys) -> None:
     with ProgressBars() as progress, progress.stage("track", "follow the target", 2, 3):
         time.sleep(0.3)
     assert "track: 2 of 3 stages (follow the target), 0 s" in capsys.readouterr().err
+
+
+def test_a_start_that_takes_long_says_that_libraries_are_loading(capsys) -> None:
+    """On a cold disk they take longer than ten seconds, and a command said nothing meanwhile."""
+    for after_s, said in ((0.05, "start: 0 of 1 stages (loading PyTorch and other libraries), 0 s"), (9, "")):
+        show_progress("lines")
+        with doctor.told_while_loading(after_s):
+            time.sleep(0.3)
+        assert capsys.readouterr().err.partition("\n")[0] == said
 
 
 def test_what_computes_notes_what_is_at_work(capsys) -> None:

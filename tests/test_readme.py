@@ -72,7 +72,7 @@ def test_the_way_from_pip_to_an_image_is_short() -> None:
 )
 def test_links_lead_somewhere(name: str) -> None:
     page = ROOT / name
-    for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
+    for target in re.findall(r"(?:\]\(|src=\")(?!https?:)([^)#\"]+)", page.read_text()):
         assert (page.parent / target).exists(), f"{name} links to {target}"
 
 

@@ -1,14 +1,16 @@
-"""The site: each page has its place; every name, command and key is explained; a dead link ends the build."""
+"""The site: each page has its place and fits a phone; names, commands and keys are explained; no dead link."""
 
 import dataclasses
 import importlib.util
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import chromium
 from evnlos.cameras.sensors import PRESETS
 from evnlos.cli import VERBS
 from evnlos.data import CaptureInfo
@@ -72,28 +74,71 @@ def test_lists_and_headings_stand_apart(text: str, apart: str) -> None:
     assert site_pages.lists_apart(text) == apart
 
 
-@pytest.mark.slow
-def test_the_site_builds_and_a_dead_link_ends_the_build(tmp_path) -> None:
-    """`make site` builds all pages; here one, since the whole takes 20 s: whole, then with dead links."""
-    docs = tmp_path / "docs"
-    docs.mkdir()
+COLUMNS = " a column | " * 14
+PAGE = f"""# Site
+
+[down](#below)
+
+## Below
+
+|{COLUMNS}
+|{"---|" * 14}
+|{COLUMNS}
+
+| `evnlos {"--a-flag " * 20}` | what it does |
+|---|---|
+
+    evnlos {"--another-flag " * 30}
+
+`{"a_name_without_a_space" * 8}`
+
+![a wide figure](wide.svg)
+"""
+
+
+def built(folder: Path, page: str) -> subprocess.CompletedProcess[str]:
+    """Build a site of one page in a folder as `make site` builds all, which takes 20 s."""
+    docs = folder / "docs"
+    docs.mkdir(exist_ok=True)
+    shutil.copy(ROOT / "docs" / "site.css", docs)
+    (docs / "wide.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" width="2000" height="9"/>')
     config = (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[0]
     config = config.replace("hooks: [tools/site_pages.py]\n", "").replace("[src]", f"[{ROOT / 'src'}]")
     config = re.sub(r"extensions: \[tools/", f"extensions: [{ROOT}/tools/", config)
-    (tmp_path / "mkdocs.yml").write_text(config)
+    (folder / "mkdocs.yml").write_text(config)
+    (docs / "README.md").write_text(page)
+    call = [sys.executable, "-m", "mkdocs", "build"]
+    return subprocess.run(call, cwd=folder, capture_output=True, text=True, timeout=300)
 
-    def built(page: str) -> subprocess.CompletedProcess[str]:
-        (docs / "README.md").write_text(page)
-        call = [sys.executable, "-m", "mkdocs", "build"]
-        return subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=300)
 
-    good = built("# Site\n\n[down](#below)\n\n## Below\n")
-    assert good.returncode == 0, good.stderr
-    assert (tmp_path / "build" / "site" / "index.html").exists()
-    bad = built("# Site\n\n[x](nowhere.md) [x](#nowhere-here) ![x](nowhere.png)\n")
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Path:
+    """A page with all that is wide."""
+    folder = tmp_path_factory.mktemp("site")
+    done = built(folder, PAGE)
+    assert done.returncode == 0, done.stderr
+    return folder / "build" / "site" / "index.html"
+
+
+@pytest.mark.slow
+def test_the_site_builds_and_a_dead_link_ends_the_build(page, tmp_path) -> None:
+    assert page.exists()
+    bad = built(tmp_path, "# Site\n\n[x](nowhere.md) [x](#nowhere-here) ![x](nowhere.png)\n")
     assert bad.returncode != 0
     for dead in ("nowhere.md", "#nowhere-here", "nowhere.png"):
         assert [line for line in bad.stderr.splitlines() if line.startswith("WARNING") and dead in line], dead
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(chromium.missing()), reason=f"{chromium.missing()}: apt-get install chromium-driver")
+def test_what_is_wide_scrolls_within_a_page_on_a_phone(page, tmp_path) -> None:
+    with chromium.Chromium(tmp_path / "profile") as browser:
+        browser.devtools(
+            "Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True
+        )
+        browser.open(page.as_uri())
+        assert browser.run("return document.querySelectorAll('main table, main pre, main img').length") == 4
+        assert browser.run("return [innerWidth, document.documentElement.scrollWidth]") == [390, 390]
 
 
 def test_each_command_has_a_page() -> None:

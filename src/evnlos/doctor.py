@@ -2,29 +2,37 @@
 
 - What the package can't work without, and how an installation gets it back; needs none of it itself.
 - Is this installation whole? Each part, what was found, and what to do where it is missing.
-- A command described without the libraries that its work needs, so that help comes at once.
+- A command described without the libraries that its work needs, so that help comes at once; what is said where
+  these take long to load.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import gc
 import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.metadata
 import importlib.util
+import inspect
+import linecache
 import os
 import platform
+import re
 import shutil
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from evnlos.errors import EvnlosError
+from evnlos.machine import ProgressBars, Step
 from evnlos.registry import __version__
 
 REQUIRED = {
@@ -307,6 +315,7 @@ WORK_LIBRARIES = (
     "safetensors",
     "pydantic",
     "threadpoolctl",
+    "unittest",  # typeguard asks whether a value is a mock, and mocks bring asyncio
 )
 """What takes most of a start, or brings that along, and describes no flag."""
 
@@ -348,6 +357,9 @@ class _StandIn:
     def __mro_entries__(self, _: tuple[Any, ...]) -> tuple[type, ...]:
         return ()
 
+    def __instancecheck__(self, _: object) -> bool:
+        return False
+
 
 class _StandInLibraries(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Import modules of `WORK_LIBRARIES` as modules that hold a `_StandIn` under every name."""
@@ -373,15 +385,20 @@ class _StandInLibraries(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 def without_work_libraries() -> Iterator[None]:
     """Import modules of this package without `WORK_LIBRARIES`: enough to describe a command, not to run it.
 
-    Afterwards what was imported meanwhile is forgotten, as far as it is of this package or of those libraries.
+    Its dataclasses have no comparison, hash, text or guard against change meanwhile, and the source of a class
+    is found by its first line. Afterwards what was imported is forgotten, as far as it is of this package or of
+    those libraries.
     """
     finder, before, collects = _StandInLibraries(), set(sys.modules), gc.isenabled()
     kept = {name: dict(vars(module)) for name, module in sys.modules.items() if _is_ours(name)}
+    ways = dataclasses.dataclass, inspect.getsource
     sys.meta_path.insert(0, finder)
     gc.disable()  # a tenth of the time, and next to nothing to collect
+    dataclasses.dataclass, inspect.getsource = _bare_dataclass(ways[0]), _quick_source(ways[1])
     try:
         yield
     finally:
+        dataclasses.dataclass, inspect.getsource = ways
         if collects:
             gc.enable()
         sys.meta_path.remove(finder)
@@ -391,6 +408,58 @@ def without_work_libraries() -> Iterator[None]:
         for name, names in kept.items():  # a package holds its modules as attributes, too
             for added in set(vars(sys.modules[name])) - set(names):
                 delattr(sys.modules[name], added)
+
+
+@contextlib.contextmanager
+def told_while_loading(after_s: float | None = None) -> Iterator[None]:
+    """Show progress while libraries are imported, where that takes long.
+
+    Args:
+        after_s: How long no progress begins, seconds. None: four on a terminal, where a bar shows at once and
+            most starts need none; else half of one, since lines wait by themselves.
+    """
+    if after_s is None:
+        after_s = 4.0 if hasattr(sys.stderr, "isatty") and sys.stderr.isatty() else 0.5
+    what, within = "start", "loading PyTorch and other libraries"
+    with ProgressBars() as progress:
+        later = threading.Timer(after_s, progress, [Step(what, 0, 1, "stages", within=within)])
+        later.daemon = True
+        later.start()
+        try:
+            yield
+        finally:
+            later.cancel()
+            later.join()
+        progress(Step(what, 1, 1, "stages"))
+
+
+def _bare_dataclass(usual: Any) -> Any:
+    """Return a decorator that makes of this package's classes dataclasses of fields and `__init__` alone.
+
+    Each other method is a text that Python compiles: a fifth of what the description of a command took.
+    """
+
+    def decorate(cls: Any = None, /, **how: Any) -> Any:
+        if cls is None:
+            return functools.partial(decorate, **how)
+        bare = {"frozen": False, "eq": False, "repr": False} if _is_ours(cls.__module__) else {}
+        return usual(cls, **how | bare)
+
+    return decorate
+
+
+def _quick_source(usual: Any) -> Any:
+    """Return a function that finds the source of a class of ours; Python parses a whole module for it."""
+
+    def source(thing: Any) -> str:
+        name = getattr(thing, "__qualname__", ".")
+        if not inspect.isclass(thing) or "." in name or not _is_ours(thing.__module__):
+            return usual(thing)
+        text = "".join(linecache.getlines(inspect.getfile(thing)))
+        found = re.search(rf"^class {name}\b.*\n(?:[ \t].*\n|\n|\).*\n)*", text, re.MULTILINE)
+        return found[0] if found else usual(thing)
+
+    return source
 
 
 def _is_ours(name: str) -> bool:

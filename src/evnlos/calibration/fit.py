@@ -216,7 +216,7 @@ def fit_setup(
     settings = Calibration() if settings is None else settings
     check_measured(settings.measured)
     stages = ("read the captures", "fit the wall", "fit the noise of the frames", "fit the event pixel")
-    stages = stages[: 4 if settings.events else 3]
+    stages = (*stages[: 4 if settings.events else 3], "judge the fit, and what the wall shows")
 
     def begin(stage: int) -> None:
         progress(Step("calibrate", stage, len(stages), "stages", within=stages[stage]))
@@ -284,7 +284,7 @@ def fit_setup(
                 capture_set, found, start_pixel, pixel.pixel, simulation.sampling, settings.seed
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
-    progress(Step("calibrate", len(stages), len(stages), "stages"))
+    begin(len(stages) - 1)
     about, curved = held.captures[0].info.camera, curvature(lit.numpy(), predicted["held out"].numpy())
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
     known, shown = dict[str, NDArray[np.float32]](), list[Target]()
@@ -294,7 +294,7 @@ def fit_setup(
         side = simulation.glyphs.target_plane.size_m
         known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
     training = training_simulation(simulation, noise, pixel, shown, (*fit.light, *held.light))
-    return SetupFit(
+    result = SetupFit(
         simulation,
         training,
         fit.names,
@@ -314,6 +314,8 @@ def fit_setup(
         (*fit.light, *held.light),
         strays,
     )
+    progress(Step("calibrate", len(stages), len(stages), "stages"))
+    return result
 
 
 def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSet, CaptureSet] | None:

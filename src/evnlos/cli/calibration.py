@@ -21,7 +21,7 @@ from evnlos.calibration.scan.film import FilmReading
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import check_files, check_there, drawn, refuse_existing, say
+from evnlos.cli.parsing import check_files, check_out, check_there, drawn, refuse_existing, say
 from evnlos.cli.recordings import Flat, Folders, Force, Presets
 from evnlos.config import to_dict
 from evnlos.lab import Phone
@@ -159,6 +159,7 @@ class ScanCommand:
     def _plan(self) -> None:
         from evnlos.calibration.scan import write_plan
 
+        check_out(self.folder, "OutFolder")
         info, found = self.plan.info(), self.plan.estimate()
         with ProgressBars() as progress:
             files = len(write_plan(self.plan, self.folder, progress))

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import ast
 import difflib
 import importlib
 import json
@@ -19,10 +18,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TextIO, cast
 
+from evnlos import doctor
 from evnlos.cli.parsing import (
     FLAG,
     LEVELS,
@@ -38,13 +39,11 @@ from evnlos.cli.parsing import (
     parse,
     todays_words,
 )
-from evnlos.doctor import WORK_LIBRARIES, examine, fault_behind, without_work_libraries
 from evnlos.errors import ConfigError, EvnlosError, PlainOutput, UnknownNameError, for_command_line, printable
 from evnlos.machine import PROGRESS, SHOWN, sleep_while_waiting
 from evnlos.registry import Kinded, __version__, kind_of
 
 # Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
-
 
 VERBS: dict[str, str] = {
     "demo": "experiment.DemoCommand",
@@ -124,7 +123,7 @@ def main(argv: list[str] | None = None) -> None:
         if isinstance(error, EvnlosError):
             print(f"evnlos {verb}: error: {for_command_line(error)}", file=sys.stderr)
             sys.exit(2)
-        fault = fault_behind(error)
+        fault = doctor.fault_behind(error)
         if fault is not None:
             text = f"{fault.name} is {fault.found}; {fault.cure} (evnlos doctor looks at all that is needed)"
         elif isinstance(error, MemoryError):
@@ -235,10 +234,8 @@ def summary_of(verb: str) -> str:
     """Return the first line of a command's description, without importing what the command needs."""
     module, _, name = VERBS[verb].partition(".")
     source = (files("evnlos.cli") / f"{module}.py").read_text(encoding="utf-8")
-    command = next(
-        node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name
-    )
-    return (ast.get_docstring(command) or "").partition("\n")[0]
+    found = re.search(rf'^class {name}\b.*:\n    """(.*?)(?:"""|\n)', source, re.MULTILINE)
+    return found[1] if found else ""
 
 
 def _unknown(verb: str) -> str:
@@ -260,11 +257,11 @@ def _answer_at_once(verb: str, rest: list[str]) -> Any:
         UnknownNameError: A name stands for nothing.
         SystemExit: Help was asked for, and printed.
     """
-    if verb == "doctor" or set(WORK_LIBRARIES) & set(sys.modules) or threading.active_count() > 1:
+    if verb == "doctor" or set(doctor.WORK_LIBRARIES) & set(sys.modules) or threading.active_count() > 1:
         return None
     refusal = light = None
     try:
-        with without_work_libraries():
+        with doctor.without_work_libraries():
             command = command_of(verb)
             if hasattr(command, "PRESETS") and any(_DECIDES.match(word) for word in rest):
                 check_names(rest)
@@ -307,13 +304,14 @@ def _command(verb: str, rest: list[str]) -> Any:
     Raises:
         ConfigError: A word does not fit, or the result could not be written, before it is worked for.
     """
-    command = command_of(verb)
+    with doctor.told_while_loading():
+        command = command_of(verb)
     if verb == "doctor" and set(rest) <= {"--json"}:  # the parser itself may be what is missing
         return command(json="--json" in rest)
     made = parse(command, rest, verb, _defaults(command, rest))
-    for one in (made, getattr(made, "settings", None)):
-        if isinstance(out := getattr(one, "out", None), Path) and not getattr(made, "dry_run", False):
-            kind, force = type(one).__annotations__.get("out", ""), getattr(made, "force", False)
+    for one, name in product((made, getattr(made, "settings", None)), ("out", "half", "preview")):
+        if isinstance(out := getattr(one, name, None), Path) and not getattr(made, "dry_run", False):
+            kind, force = type(one).__annotations__.get(name, ""), getattr(made, "force", False)
             check_out(out, kind, force, _BESIDE.get(verb, ()))
     return made
 
@@ -334,12 +332,8 @@ def _defaults(command: type[Any], rest: list[str]) -> Any:
         if word is not None and hasattr(command, f"with_{name}"):
             settings = getattr(command, f"with_{name}")(settings, word)
     settings = _of_kinds(settings, rest)
-    required = {
-        item.name: tyro.MISSING
-        for item in fields(command)
-        if item.default is MISSING and item.default_factory is MISSING
-    }
-    return command(**required | {"settings": settings})
+    bare = (item for item in fields(command) if item.default is MISSING and item.default_factory is MISSING)
+    return command(**{item.name: tyro.MISSING for item in bare} | {"settings": settings})
 
 
 def _preset(command: type[Any], rest: list[str]) -> Any:
@@ -389,7 +383,7 @@ class DoctorCommand:
 
     def run(self) -> None:
         """Print each part; exit code 1 where a needed one is broken."""
-        parts = examine()
+        parts = doctor.examine()
         if self.json:
             print(json.dumps({"parts": [asdict(part) for part in parts]}))
         else:

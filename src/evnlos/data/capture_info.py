@@ -363,8 +363,8 @@ def begin_capture(folder: str | Path, width: int, height: int, name: str = "my c
         DataError: The folder has a capture.yaml already, or is a file; or the size is none.
     """
     path = (folder := Path(folder)) / "capture.yaml"
-    if folder.exists() and not folder.is_dir():
-        raise DataError(f"{folder} is a file; give a folder for the capture")
+    if wrong := next((one for one in (folder, *folder.parents) if one.exists() and not one.is_dir()), None):
+        raise DataError(f"{wrong} is a file; give a folder for the capture")
     if path.exists():
         raise DataError(f"{path} exists; edit it, or give another folder")
     if width < 1 or height < 1:
