@@ -127,6 +127,7 @@ WHOLE_CHAPTERS = {
     "calibration/fit.py",
     "calibration/scan/film.py",
     "calibration/wall_fit.py",
+    "calibration/wall_search.py",
     "cameras/frame_camera.py",
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",

@@ -536,6 +536,48 @@ def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
     assert after < limit < before
 
 
+@pytest.fixture
+def recorded(shared_data, tmp_path) -> list[Path]:
+    """Copies of twelve captures that other optics made."""
+    folders = [shared_data / "captures" / f"near_{c}" for c in "ABDEFHLMNSTU"]
+    if not folders[0].is_dir():
+        pytest.skip(f"no captures at {folders[0].parent}")
+    return [Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in folders]
+
+
+FRAMES_ALONE = Calibration(events=False, holdout=("H", "M", "U"))
+
+
+@pytest.mark.thorough
+def test_captures_exposed_for_different_times_are_fitted_to_their_noise(recorded) -> None:
+    factors = [1.11, 1.01, 1.12, 0.99, 0.98, 1.145, 0.90, 1.03, 1.06, 1.0, 1.0, 0.88]
+    for folder, factor in zip(recorded, factors, strict=True):
+        for path in (folder / "frames").iterdir():
+            level = np.rint(np.asarray(Image.open(path)) * factor).clip(0, 255)
+            Image.fromarray(level.astype(np.uint8)).save(path)
+    found = fit_setup(recorded, FRAMES_ALONE)
+    left = found.residuals["frames held out, without pattern"]
+    assert left.after < 1.1 * left.noise and found.strays == {}
+    names = [folder.name for folder in recorded]
+    told = dict(zip((*found.fitted, *found.held_out), (gain for gain, _ in found.light), strict=True))
+    own = np.array([told[name] for name in names])
+    assert own / own.mean() == pytest.approx(np.array(factors) / np.mean(factors), rel=0.01)
+
+
+@pytest.mark.thorough
+def test_captures_whose_labels_were_exchanged_are_left_out_and_named(recorded) -> None:
+    one, other = (folder / "target.png" for folder in recorded if folder.name in ("near_H", "near_L"))
+    first, second = one.read_bytes(), other.read_bytes()
+    one.write_bytes(second)
+    other.write_bytes(first)
+    found = fit_setup(recorded, FRAMES_ALONE)
+    left = found.residuals["frames held out, without pattern"]
+    assert set(found.strays) == {"near_H", "near_L"} and min(found.strays.values()) > 5
+    assert not set(found.strays) & {*found.fitted, *found.held_out}
+    assert left.after < 1.05 * left.noise
+    assert "near_H" in warnings_of(found)[0] and "near_L" in warnings_of(found)[0]
+
+
 def test_a_number_on_the_bound_of_the_search_is_named(fit) -> None:
     assert fit.optics.on_bound == {} and fit.unexplained is None and warnings_of(fit) == []
     parameters = tuple(

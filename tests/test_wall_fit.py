@@ -181,16 +181,22 @@ def test_measurements_that_cannot_be_are_refused(measured, words):
         fit_setup([], Calibration(measured=measured))
 
 
-def test_mirrored_frames_are_refused(rendered):
+@pytest.mark.parametrize(
+    ("rows", "columns", "words"),
+    [(1, -1, "the other way round; mirror"), (-1, 1, "upside down; "), (-1, -1, "turned by 180 degrees; ")],
+)
+def test_turned_frames_are_refused(rendered, rows: int, columns: int, words: str) -> None:
     fit, held, _ = rendered
     turned = [
-        CaptureSet(
-            tuple(replace(c, frames=np.ascontiguousarray(c.frames[..., ::-1])) for c in capture_set.captures),
-            0.08,
+        replace(
+            one,
+            captures=tuple(
+                replace(c, frames=np.ascontiguousarray(c.frames[:, ::rows, ::columns])) for c in one.captures
+            ),
         )
-        for capture_set in (fit, held)
+        for one in (fit, held)
     ]
-    with pytest.raises(DataError, match="the other way round"):
+    with pytest.raises(DataError, match=words):
         fit_wall(turned[0], turned[1], KNOWN, columns=24)
 
 

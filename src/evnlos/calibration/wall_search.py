@@ -71,6 +71,12 @@ _COARSE = 25  # columns of the working images of the scan
 _CELLS_DOWN = 11  # of the target in the scan
 _COARSE_FRAMES, _FINE_FRAMES = 90, 160
 _MIRRORED, _LEAST = 0.6, 0.9
+_TURNS = {
+    "the other way round": ("mirror the frames, or turn the motion's direction", False, True),
+    "upside down": ("turn the frames top for bottom", True, False),
+    "turned by 180 degrees": ("turn the frames by 180 degrees", True, True),
+}
+"""How frames may be turned: what cures it, whether rows and whether columns run the other way."""
 _CAUTION = 2.0  # on errors: slopes and pose make up for each other further than the linear estimate knows
 
 
@@ -128,9 +134,9 @@ def _scanned(data: WallData, known: Pose, freedoms: Sequence[Freedom]) -> list[W
     angles = (known.camera_angle_deg,) if "camera_angle_deg" in measured else _ANGLES_DEG
     views = (1.0,) if "field_of_view_deg" in measured else _VIEWS
     distances = (1.0,) if "camera_distance_m" in measured else _DISTANCES
-    turned = replace(data, seen=data.seen[_mirrored(data)])
+    turned = {how: replace(data, seen=data.seen[_turned(data, *sides)]) for how, (_, *sides) in _TURNS.items()}
     tried: list[tuple[float, WallState]] = []
-    mirrored = math.inf
+    other = dict.fromkeys(turned, math.inf)
     for angle, view, away in itertools.product(angles, views, distances):
         note(f"camera at {angle:g} degrees, {view:g} x the view, {away:g} x the distance")
         middle = -known.distance_m * math.tan(math.radians(angle))
@@ -145,8 +151,8 @@ def _scanned(data: WallData, known: Pose, freedoms: Sequence[Freedom]) -> list[W
         )
         try:
             state, left = start_at(data, pose)
-            if view == away == 1.0:
-                mirrored = min(mirrored, start_at(turned, pose)[1])
+            for how in turned if view == away == 1.0 else ():
+                other[how] = min(other[how], start_at(turned[how], pose)[1])
         except ConfigError:  # this camera sees past the wall
             continue
         tried.append((left, state))
@@ -154,11 +160,9 @@ def _scanned(data: WallData, known: Pose, freedoms: Sequence[Freedom]) -> list[W
         raise DataError("no camera near the start sees the wall; give a start that is nearer to the setup")
     tried.sort(key=lambda one: one[0])
     least = tried[0][0]
-    if mirrored < _MIRRORED * least:
-        raise DataError(
-            "the frames follow the targets the other way round; mirror the frames, or turn the motion's "
-            "direction"
-        )
+    likeliest = min(other, key=lambda how: other[how])
+    if other[likeliest] < _MIRRORED * least:
+        raise DataError(f"the frames follow the targets {likeliest}; {_TURNS[likeliest][0]}")
     if least > _LEAST:
         raise DataError(
             f"the targets explain {100 * (1 - math.sqrt(least)):.0f} % of what differs between captures, below "
@@ -168,10 +172,12 @@ def _scanned(data: WallData, known: Pose, freedoms: Sequence[Freedom]) -> list[W
     return [state for _, state in tried]
 
 
-def _mirrored(data: WallData) -> NDArray[np.int64]:
-    """Return each pixel's mirror image, left for right; itself where that takes no part."""
+def _turned(data: WallData, upside_down: bool, mirrored: bool) -> NDArray[np.int64]:
+    """Return the pixel that each one is in a turned image; itself where that takes no part."""
     row, column = np.divmod(data.pixel, data.grid[1])
-    wanted = (row + 1) * data.grid[1] - 1 - column
+    row = data.grid[0] - 1 - row if upside_down else row
+    column = data.grid[1] - 1 - column if mirrored else column
+    wanted = row * data.grid[1] + column
     at = np.minimum(np.searchsorted(data.pixel, wanted), len(data.pixel) - 1)
     return np.where(data.pixel[at] == wanted, at, np.arange(len(at)))
 
