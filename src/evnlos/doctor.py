@@ -421,8 +421,14 @@ def told_while_loading(after_s: float | None = None) -> Iterator[None]:
     if after_s is None:
         after_s = 4.0 if hasattr(sys.stderr, "isatty") and sys.stderr.isatty() else 0.5
     what, within = "start", "loading PyTorch and other libraries"
-    with ProgressBars() as progress:
-        later = threading.Timer(after_s, progress, [Step(what, 0, 1, "stages", within=within)])
+    with contextlib.ExitStack() as stack:
+        shown = list[ProgressBars]()
+
+        def begin() -> None:
+            shown.append(stack.enter_context(ProgressBars()))
+            shown[0](Step(what, 0, 1, "stages", within=within))
+
+        later = threading.Timer(after_s, begin)
         later.daemon = True
         later.start()
         try:
@@ -430,7 +436,8 @@ def told_while_loading(after_s: float | None = None) -> Iterator[None]:
         finally:
             later.cancel()
             later.join()
-        progress(Step(what, 1, 1, "stages"))
+            for progress in shown:
+                progress(Step(what, 1, 1, "stages"))
 
 
 def _bare_dataclass(usual: Any) -> Any:
