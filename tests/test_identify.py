@@ -326,7 +326,10 @@ def test_all_ask_about_the_targets_that_the_file_states(tmp_path, capsys):
     found, page = json.loads(capsys.readouterr().out), limits_of(simulation)
     assert found["analysis"]["target_size_m"] == page.settings.target_size_m == 1.2
     assert found["camera_noise"]["patterns_above_noise"] == page.at_camera.patterns
-    shown, told = Shown.by(simulation), verdict_on(named_setup(path), None)
+    shown, told = (
+        Shown.by(simulation),
+        verdict_on(named_setup(path).setup, None, stated_m=named_setup(path).target_m),
+    )
     assert shown.patterns == page.at_camera.patterns and told.wall == page.wall
     assert "of this wall and a target of 1.2 m, " in told.wall
     lab = Lab(glyphs=dataclasses.replace(Lab().glyphs, target_plane=TargetPlane(size_m=0.5)), setup=METRES)

@@ -27,6 +27,7 @@ OutFile = Path
 OutImage = Path
 """The same: a file whose ending names a format of images."""
 
+Evidence = Literal["frames", "events", "both"]  # what an estimate is made of
 Colour = Literal["red", "green", "blue"]
 COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
 """Colours in the order of an image's channels."""

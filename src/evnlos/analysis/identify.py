@@ -25,7 +25,7 @@ from evnlos.analysis.linearized import (
 )
 from evnlos.errors import MissingDependencyError
 from evnlos.machine import note
-from evnlos.setups import NamedSetup, Setup
+from evnlos.setups import Setup
 from evnlos.types import aligned, derive_seed
 
 if TYPE_CHECKING:
@@ -263,25 +263,25 @@ class Verdict:
 
 
 def verdict_on(
-    setup: Setup | NamedSetup | None,
+    setup: Setup | None,
     report: ConfidenceReport | None,
     no_confidence: str | None = None,
     frames: int = 1,
     is_stated: bool = True,
+    stated_m: float | None = None,
 ) -> Verdict:
     """Return the verdict on a reconstruction.
 
     Args:
-        setup: The setup that the recording is taken to be of, where it is known and linear; a named one says
-            how large its targets are.
+        setup: The setup that the recording is taken to be of, where it is known and linear.
         report: How far to believe the images, where that can be told.
         no_confidence: Why it can't be told.
         frames: Frames that an image is made of: all of a network of whole sequences, else 1.
         is_stated: Whether the setup is that of the recording by somebody's word; else it is that of the
             weights, and where nothing was measured it says nothing of this wall.
+        stated_m: Side of the targets that the setup's file states, metres; None where it states none.
     """
     wall, which = "", "this wall" if is_stated else "the wall that these weights know"
-    setup, stated_m = (setup.setup, setup.target_m) if isinstance(setup, NamedSetup) else (setup, None)
     try:
         if setup is not None and setup.is_linear and (is_stated or report is None or report.measured):
             wall = identify(setup, replace(QUICK, frames=frames), stated_m=stated_m).allowed(which)

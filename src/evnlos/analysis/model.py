@@ -31,7 +31,7 @@ from evnlos.machine import Progress, counted, note, silent
 from evnlos.metrics import psnr
 from evnlos.models import ConfidenceReport, Reconstructor, Weights, load_weights, published_setup
 from evnlos.scene import Motion
-from evnlos.setups import NamedSetup, Setup, named_setup
+from evnlos.setups import Setup, named_setup
 
 _SAME_LIGHT = (0.75, 1.33)
 """Range of a recording's brightness, in that of its calibrated setup, in which the setup's gain is its own."""
@@ -129,15 +129,15 @@ class Model:
 
     def known_setup(self) -> Setup | None:
         """Return the setup that the network was trained for; None where it is unknown."""
-        return None if (found := self.known()) is None else found.setup
+        return self.known()[0]
 
-    def known(self) -> NamedSetup | None:
-        """Return `known_setup` with its name and the side of its targets."""
+    def known(self) -> tuple[Setup | None, float | None]:
+        """Return `known_setup` and the side of the targets that its file states, metres."""
         for named in filter(None, (self.weights.sampling.setup, self._known_setup)):
             with suppress(ConfigError, DataError):  # moved, or of another machine
                 found = named_setup(named)
-                return found if found.setup.is_linear else None
-        return None
+                return (found.setup, found.target_m) if found.setup.is_linear else (None, None)
+        return None, None
 
     def reconstruct(
         self,

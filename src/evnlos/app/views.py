@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -34,6 +33,7 @@ from evnlos.errors import DataError
 from evnlos.events import time_surface
 from evnlos.events.volume import WORDS
 from evnlos.inverse import SequenceOperator, SequenceProblem
+from evnlos.inverse.event_film import QUICK_MODES
 from evnlos.metrics import psnr
 from evnlos.models import (
     FilmSolver,
@@ -56,7 +56,7 @@ from evnlos.plot.figures import (
 from evnlos.report.pictures import data_uri, grey
 from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup
-from evnlos.types import Plane
+from evnlos.types import Evidence, Plane
 
 _PAGE = "page-{}-sequence"  # trained on the simulation `page`
 _TITLES = {"frame": "network, frames", "event": "network, events", "fusion": "network, both"}
@@ -129,7 +129,6 @@ def own_networks(paths: Iterable[Path]) -> Networks:
     return Networks(found)
 
 
-_FILM_MODES = 24  # of a film that events tell: more take seconds and show no more through this camera
 _MOST_IMAGES = 120  # of a film
 _DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far an image may go from it
 _CELLS = 16  # a side of the target plane of the whole sequence
@@ -202,12 +201,12 @@ def from_whole_sequence(recorded: Recorded) -> Reconstruction:
 
 @lru_cache(maxsize=4)
 def _film_solver(setup: Setup, plane: Plane) -> FilmSolver:
-    return FilmSolver(setup, plane, modes=_FILM_MODES)
+    return FilmSolver(setup, plane, modes=QUICK_MODES)
 
 
 def from_film(
     recorded: Recorded,
-    evidence: Literal["frames", "events", "both"],
+    evidence: Evidence,
     taken: tuple[Setup, Plane] | None = None,
 ) -> Reconstruction:
     """Return the film of a hidden plane that changes, from one in so many positions where there are very many.

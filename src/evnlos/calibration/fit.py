@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -22,6 +22,7 @@ from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
 from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
+from evnlos.calibration.wall_fit import relit
 from evnlos.calibration.wall_search import check_measured, curvature, fit_wall, frame_doubt
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
@@ -342,8 +343,7 @@ def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSe
         for capture, (target, ambient) in zip(one.captures, parts.tolist(), strict=True):
             usual = np.float32(middle[1] * one.peak) * around
             level = (capture.frames - np.float32(ambient) * usual) / np.float32(target) + usual
-            frames = np.rint(level).clip(0, one.peak).astype(capture.frames.dtype)
-            captures.append(replace(capture, frames=np.where(capture.frames >= one.peak, one.peak, frames)))
+            captures.append(relit(capture, level, one.peak))
         before = np.array(one.light or [(1.0, 1.0)] * len(parts))
         light = before * parts
         light[:, 1] = before[:, 1] + before[:, 0] * (parts[:, 1] - 1)
@@ -377,38 +377,16 @@ def _fit_any(
 ) -> tuple[TransportFit, CaptureSet, CaptureSet, dict[str, float]]:
     """Return the fit of a wall of any kind, the captures behind it, and those that do not fit the others.
 
-    The captures are `steadied` where that helps. A capture of a wrong target or motion spoils the fit of all:
-    one that keeps much more than the others is left out where it does so behind the fit of these, too. It comes
-    with what it keeps over the median.
+    A capture of a wrong target or motion spoils the fit of all: one that keeps much more than the others is
+    left out where it does so behind the fit of these, too. It comes with what it keeps over the median.
     """
 
     def wall(one: CaptureSet, other: CaptureSet) -> TransportFit:
         how = {"fit_distance": settings.fit_distance, "measured": settings.measured}
         return fit_wall(one, other, start, **how).optics
 
-    def is_better(other: CaptureSet, setup: Setup) -> bool:
-        after, before = (
-            model.left(model.predict(by))
-            for model, by in (
-                (FrameModel(other, other.shape, _EVERY), setup),
-                (FrameModel(held, held.shape, _EVERY), optics.setup),
-            )
-        )
-        return after < _STEADIER * before
-
-    optics, recorded = wall(fit, held), (fit, held)
-    if _light_changes(fit, held, optics.setup) is not None:
-        note("light that differs from capture to capture")
-        there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
-        steady, again = recorded, optics
-        for _ in range(_MOST_STEADYING):
-            steadier = steadied(*steady, there)
-            if steadier is None:
-                break
-            steady, again = steadier, wall(*steadier)
-            there = again.setup
-        if is_better(steady[1], there):
-            optics, (fit, held) = again, steady
+    recorded = fit, held
+    optics, fit, held = _fit_steadied(wall, fit, held)
     doubtful = [name for name, kept in _kept(fit, held, optics.setup).items() if kept > _DOUBTFUL]
     fewer = _without(fit, doubtful), _without(held, doubtful)
     most = _MOST_STRAYS * (len(fit.captures) + len(held.captures))
@@ -424,6 +402,31 @@ def _fit_any(
         optics, fit, held, more = _fit_any(settings, fit, held, start)
         return optics, fit, held, strays | more
     return again, _without(fit, strays), _without(held, strays), strays
+
+
+def _fit_steadied(
+    wall: Callable[[CaptureSet, CaptureSet], TransportFit], fit: CaptureSet, held: CaptureSet
+) -> tuple[TransportFit, CaptureSet, CaptureSet]:
+    """Return the fit of a wall and the captures behind it, `steadied` where that helps."""
+
+    def left(setup: Setup, other: CaptureSet) -> float:
+        model = FrameModel(other, other.shape, _EVERY)
+        return model.left(model.predict(setup))
+
+    optics = wall(fit, held)
+    if _light_changes(fit, held, optics.setup) is None:
+        return optics, fit, held
+    note("light that differs from capture to capture")
+    steady, again = (fit, held), optics
+    there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
+    for _ in range(_MOST_STEADYING):
+        steadier = steadied(*steady, there)
+        if steadier is None:
+            break
+        steady, again = steadier, wall(*steadier)
+        there = again.setup
+    is_better = left(there, steady[1]) < _STEADIER * left(optics.setup, held)
+    return (again, *steady) if is_better else (optics, fit, held)
 
 
 def _kept(captures: CaptureSet, others: CaptureSet, setup: Setup) -> dict[str, float]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Array, CaptureSet, WallData, wall_data
 from evnlos.calibration.transport_fit import BLOCKS, scatter_of
+from evnlos.data import Capture
 from evnlos.errors import ConfigError
 from evnlos.machine import note
 from evnlos.optics.facets import (
@@ -286,9 +287,20 @@ def evenly_lit(captures: CaptureSet, state: WallState, plane: Plane) -> CaptureS
     data, frames = wall_data(captures, 25, plane, every=8), []
     own = state.gains(data)[np.unique(data.capture, return_index=True)[1]]
     for one, gain in zip(captures.captures, own.tolist(), strict=True):
-        level = np.rint(one.frames / np.float32(gain)).clip(0, captures.peak).astype(one.frames.dtype)
-        frames.append(replace(one, frames=np.where(one.frames >= captures.peak, one.frames, level)))
+        frames.append(relit(one, one.frames / np.float32(gain), captures.peak))
     return replace(captures, captures=tuple(frames))
+
+
+def relit(capture: Capture, levels: NDArray, peak: int) -> Capture:
+    """Return a capture with other light in its frames; what was saturated stays so.
+
+    Args:
+        capture: The capture.
+        levels: Its frames in the other light, digital numbers that need not be whole, [N, H, W].
+        peak: Largest digital number.
+    """
+    frames = np.rint(levels).clip(0, peak).astype(capture.frames.dtype)
+    return replace(capture, frames=np.where(capture.frames >= peak, capture.frames, frames))
 
 
 def refine(

@@ -27,7 +27,7 @@ from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run, latency_table
 from evnlos.live.sources import SourceOptions, check_source, film_of, open_live, so_far_of
 from evnlos.machine import ProgressBars
-from evnlos.types import OutFolder
+from evnlos.types import Evidence, OutFolder
 
 if TYPE_CHECKING:
     from evnlos.experiment import Arm, Study
@@ -309,7 +309,7 @@ class LiveCommand:
     image of its film (as `invert --changing`), about the middle of the target plane of --setup."""
     setup: Path | None = None
     """With --changing: the setup, as for `invert`; a name, a settings file, or a folder of `calibrate`."""
-    evidence: Annotated[Literal["frames", "events", "both"], tyro.conf.arg(name="from")] = "frames"
+    evidence: Annotated[Evidence, tyro.conf.arg(name="from")] = "frames"
     """With --changing: what the film is made of."""
     cells: int = 24
     """With --changing: cells along the plane's longer side."""
@@ -364,8 +364,8 @@ class LiveCommand:
                     model = load_model(name)
                     say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
                 engine, why = Engine(model and model.weights), _LIVE_CONFIDENCE if model else _FILM_CONFIDENCE
-                wall, seen = (model.known(), engine.modality.name) if model else (wall, "no network")
-                verdict = verdict_on(wall, None, why, is_stated=model is None)
+                seen, known = (engine.modality.name, model.known()) if model else ("no network", (wall, None))
+                verdict = verdict_on(known[0], None, why, is_stated=model is None, stated_m=known[1])
                 verdict = verdict if model else replace(verdict, guessed="")  # no network draws
                 if self.so_far is not None:
                     beside = so_far_of(self.so_far, source)

@@ -22,7 +22,7 @@ from evnlos.cli.recordings import Folders, Force, tracks_text
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
-from evnlos.types import OutImage
+from evnlos.types import Evidence, OutImage
 
 if TYPE_CHECKING:
     from evnlos.data import Capture
@@ -66,7 +66,7 @@ class InvertCommand:
     """Captures: choices of so many positions to average the scores over."""
     colours: bool = False
     """Captures: an image in colour, of frames in colour, with --from of events behind colour filters too."""
-    evidence: Annotated[Literal["frames", "events", "both"] | None, tyro.conf.arg(name="from")] = None
+    evidence: Annotated[Evidence | None, tyro.conf.arg(name="from")] = None
     """Captures: estimate the target from these by one likelihood of the whole sequence and a Gaussian prior of
     handwriting, with the uncertainty of each cell; none = the solvers, which take frames. Events need the
     thresholds and the optics of this very sensor: it is said where they do not fit."""
@@ -277,7 +277,7 @@ class InvertCommand:
         result["seconds"] = round(time.perf_counter() - clock, 1)
         print(json.dumps(result) if self.json else film_text(result))
 
-    def _estimate(self, setup: Path, evidence: Literal["frames", "events", "both"]) -> None:
+    def _estimate(self, setup: Path, evidence: Evidence) -> None:
         from evnlos.analysis.confidence import levels_text, sequence_doubts
         from evnlos.cli.invert_captures import estimate_captures, sequence_text
         from evnlos.plot.results import draw_inversion, estimate_panels

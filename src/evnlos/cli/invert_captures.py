@@ -36,7 +36,7 @@ from evnlos.models import TargetEstimate, estimate_target, load_prior
 from evnlos.setups import Setup
 from evnlos.setups.load import linear_setup
 from evnlos.tracking import temporal_noise
-from evnlos.types import COLOURS, Colour, Plane
+from evnlos.types import COLOURS, Colour, Evidence, Plane
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,6 @@ def figures_of(name: str, solution: Solution) -> dict[str, Any]:
     }
 
 
-Evidence = Literal["frames", "events", "both"]
 _SHOWN = 3  # samples that stand beside an image
 
 

@@ -147,6 +147,8 @@ class FilmFrames(NamedTuple):
 
 MOST_MODES = 64
 """Strongest modes of a film that events are asked for, at most."""
+QUICK_MODES = 24
+"""The same where an image may take seconds and not minutes."""
 _MOST, _FEWEST = 5000, 16  # unknowns of a film: what bounds the time; modes that are worth it
 _PIXELS = 256  # of a block
 _BRIGHT = 0.25  # mean brightness of the plane

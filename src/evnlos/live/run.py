@@ -16,14 +16,14 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.live.packet import Chunk, ChunkQueue, Clock, EventSource, SystemClock
-from evnlos.types import Events
+from evnlos.types import Events, Evidence
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -237,8 +237,6 @@ class RateOptions:
             raise ConfigError(f"seconds is {self.seconds}; give a positive number")
 
 
-Evidence = Literal["frames", "events", "both"]
-"""What a film is made of."""
 Made = tuple[NDArray[np.float32], int]
 """An image, float32 [H, W], 0..1, and the event time up to which it knows what was seen, microseconds."""
 

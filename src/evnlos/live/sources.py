@@ -23,10 +23,10 @@ from evnlos.events.recording import CropOptions, Recording
 from evnlos.live.device import DEVICES, DeviceSource, NeuromorphicDriver, device_of
 from evnlos.live.growing_file import GrowingFile
 from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
-from evnlos.live.run import Beside, Evidence, FilmImages, ImagesSoFar, check_sequence
+from evnlos.live.run import Beside, FilmImages, ImagesSoFar, check_sequence
 from evnlos.live.streams import DvSource, WordInput
 from evnlos.live.udp import AestreamSource, UdpSource
-from evnlos.types import Events, Plane
+from evnlos.types import Events, Evidence, Plane
 
 if TYPE_CHECKING:
     from evnlos.data import Capture
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from evnlos.setups import Setup
 
 _NAP_S = 0.05  # longest sleep before `stop` is asked again
-_FILM_MODES = 24  # of a film that events tell, which may take seconds and not minutes
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,13 +366,14 @@ def film_of(
         ConfigError: The seconds are too few, or the event model states no law of its crossings.
         DataError: The source has no frames, and they are to be seen.
     """
+    from evnlos.inverse.event_film import QUICK_MODES  # which compiles
     from evnlos.models import FilmSolver, RunningFilm
 
     if evidence != "events" and not source.has_frames:
         raise DataError(f"{source.name} has no frames; give --from events, or a source with frames")
     if evidence != "frames":
         setup.pixel.known_law(1.0)
-    about = FilmSolver(setup, plane, modes=_FILM_MODES), evidence, newest_s
+    about = FilmSolver(setup, plane, modes=QUICK_MODES), evidence, newest_s
     RunningFilm(*about)  # refuses what cannot be
     size = source.capture.events.shape if isinstance(source, Replay) and source.capture else None
     return Beside("plane that changes", FilmImages, (*about, size), plane.shape, evidence == "events")

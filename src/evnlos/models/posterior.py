@@ -65,7 +65,7 @@ from evnlos.models.weights import weights_folders
 from evnlos.optics import MatrixTransport
 from evnlos.setups import Setup
 from evnlos.tensor_file import TensorFile
-from evnlos.types import Colour, Events, Plane
+from evnlos.types import Colour, Events, Evidence, Plane
 
 SPREAD = 0.5
 """Standard deviation that inputs of the network are scaled by; of bright and dark cells in equal parts."""
@@ -313,7 +313,7 @@ class TargetEstimate:
 def estimate_target(
     capture: Capture,
     setup: Setup,
-    evidence: Literal["frames", "events", "both"] = "both",
+    evidence: Evidence = "both",
     pattern: FixedPattern | None = None,
     prior: LearnedPrior | None = None,
     samples: int = 32,
@@ -497,9 +497,7 @@ class RunningFilm:
         ConfigError: The seconds are too few for three images, or not finite.
     """
 
-    def __init__(
-        self, solver: FilmSolver, evidence: Literal["frames", "events", "both"], newest_s: float
-    ) -> None:
+    def __init__(self, solver: FilmSolver, evidence: Evidence, newest_s: float) -> None:
         if not 3 * _FILM_STEP_S <= newest_s < math.inf:
             raise ConfigError(f"newest_s is {newest_s:g}; give {3 * _FILM_STEP_S:g} seconds or more")
         self._solver, self._evidence, self._newest_us = solver, evidence, round(1e6 * newest_s)
@@ -566,7 +564,7 @@ def estimate_film_of(
     capture: Capture,
     setup: Setup,
     plane: Plane,
-    evidence: Literal["frames", "events", "both"] = "frames",
+    evidence: Evidence = "frames",
     pattern: FixedPattern | None = None,
     columns: int = 64,
     static: float | None = None,

@@ -33,7 +33,7 @@ from evnlos.events.volume import OFF_RGB, ON_RGB, WORDS
 from evnlos.files import check_folder, new_folder, write_atomically
 from evnlos.machine import Progress, Step, silent
 from evnlos.models import ConfidenceReport, published_for
-from evnlos.setups import NamedSetup, Setup
+from evnlos.setups import Setup
 
 _COLOURS = ("#0b5fa5", "#b23a12", "#2f7d32", "#7a3fa0", "#8a6d00", "#00788a", "#a02c5d", "#5b6470", "#3d4fc4")
 _WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM = 980, 300, 60, 16, 40
@@ -274,8 +274,8 @@ def reconstruct_capture(
             truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
             found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
         of = (len(images) if model.weights.network.sees_sequence else 1), setup is not None
-        wall = model.known() if setup is None else NamedSetup(setup, "", "", target_m)
-        verdict = verdict_on(wall, confidence, made.no_confidence, *of)
+        wall, stated_m = model.known() if setup is None else (setup, target_m)
+        verdict = verdict_on(wall, confidence, made.no_confidence, *of, stated_m)
         found |= {"verdict": asdict(verdict), "in_words": _in_words(found, verdict, track)}
         title = f"{recording.name}, reconstructed by {found['weights']}"
         sheet = result_sheet(title, images.numpy(), samples, sampling, confidence, found["in_words"])
