@@ -125,6 +125,7 @@ WHOLE_CHAPTERS = {
     "analysis/confidence.py",
     "app/views.py",
     "calibration/fit.py",
+    "calibration/frame_model.py",
     "calibration/scan/film.py",
     "calibration/wall_fit.py",
     "calibration/wall_search.py",

@@ -21,6 +21,7 @@ from evnlos.calibration import (
     Calibration,
     CaptureSet,
     FrameModel,
+    Own,
     Residual,
     Shown,
     calibration_values,
@@ -31,13 +32,13 @@ from evnlos.calibration import (
     read_capture_set,
     rows_of,
     table,
+    training_simulation,
     warnings_of,
     write_setup,
 )
-from evnlos.calibration.captures import paper
+from evnlos.calibration.captures import paper, working_shape
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import block_counts, count_map, read_recordings, within
-from evnlos.calibration.frame_model import working_shape
 from evnlos.calibration.transport_fit import clustered_error, levenberg_marquardt, values_of
 from evnlos.calibration.wall_search import curvature, frame_doubt
 from evnlos.cameras import EventPixel, FrameCamera
@@ -559,9 +560,41 @@ def test_captures_exposed_for_different_times_are_fitted_to_their_noise(recorded
     left = found.residuals["frames held out, without pattern"]
     assert left.after < 1.1 * left.noise and found.strays == {}
     names = [folder.name for folder in recorded]
-    told = dict(zip((*found.fitted, *found.held_out), (gain for gain, _ in found.light), strict=True))
+    told = dict(zip(found.captures, (own.target for own in found.own), strict=True))
     own = np.array([told[name] for name in names])
     assert own / own.mean() == pytest.approx(np.array(factors) / np.mean(factors), rel=0.01)
+
+
+@pytest.mark.thorough
+def test_targets_started_by_hand_are_fitted_to_the_noise(recorded) -> None:
+    """Each some millimetres beside where its notes place it, and each at another speed."""
+    draw = np.random.default_rng(3)
+    late_m, faster = 0.003 * draw.standard_normal(len(recorded)), 1 + 0.02 * draw.standard_normal(len(recorded))
+    for folder, late, speed in zip(recorded, late_m.tolist(), faster.tolist(), strict=True):
+        about = yaml.safe_load((folder / "capture.yaml").read_text())
+        about["motion"]["start_m"] += late
+        about["motion"]["speed_m_s"] *= speed
+        (folder / "capture.yaml").write_text(yaml.safe_dump(about))
+    found = fit_setup(recorded, FRAMES_ALONE)
+    left = found.residuals["frames held out, without pattern"]
+    assert left.after < 1.1 * left.noise and found.strays == {}
+    told = dict(zip(found.captures, found.own, strict=True))
+    speeds = np.array([told[folder.name].speed for folder in recorded]) * faster
+    assert speeds / np.median(speeds) == pytest.approx(np.ones(len(recorded)), abs=2e-3)
+
+
+@pytest.mark.thorough
+def test_ambient_light_that_changes_while_captures_are_recorded_is_taken_off(recorded) -> None:
+    """Clouds: by up to a quarter of it either way, from the first frame to the last."""
+    for number, folder in enumerate(recorded):
+        paths = sorted((folder / "frames").iterdir())
+        frames = np.stack([np.asarray(Image.open(path)) for path in paths])
+        growth = 0.5 * np.percentile(frames, 5) * (-1) ** number * np.linspace(-0.5, 0.5, len(frames))
+        for path, frame, more in zip(paths, frames, growth, strict=True):
+            Image.fromarray(np.rint(frame + more).clip(0, 255).astype(np.uint8)).save(path)
+    found = fit_setup(recorded, FRAMES_ALONE)
+    left = found.residuals["frames held out, without pattern"]
+    assert left.after < 1.1 * left.noise and found.motion_words == []
 
 
 @pytest.mark.thorough
@@ -690,10 +723,29 @@ def test_captures_that_do_not_fit_the_others_are_named(fit) -> None:
 def test_light_that_differs_from_capture_to_capture_stands_in_the_table(fit) -> None:
     notes = {
         row.name: row.note
-        for row in rows_of(replace(fit, light=((0.9, 1.0), (1.25, 1.0))), START.pixel, START.frame_camera)
+        for row in rows_of(replace(fit, own=(Own(0.9), Own(1.25))), START.pixel, START.frame_camera)
     }
     assert notes["setup.gain"] == "0.90 to 1.25 times it from capture to capture"
     assert notes["setup.ambient"] == ""
+
+
+def test_targets_that_were_not_where_notes_place_them_are_warned_of(fit) -> None:
+    assert fit.motion_words == []
+    own = [Own()] * len(fit.captures)
+    own[1] = Own(ahead_m=-0.0044, speed=1.021)
+    moved = replace(fit, own=tuple(own))
+    line = next(one for one in warnings_of(moved) if one.startswith("targets are"))
+    assert line.startswith(
+        f"targets are up to 4.4 mm beside their stated places ({fit.captures[1]} most), their"
+    )
+    assert "their speeds +0.0 to +2.1 % off" in line and "mend `motion` in capture.yaml" in line
+    assert calibration_values(moved, [])["own"][fit.captures[1]]["ahead_m"] == -0.0044
+    slack = moved.training.vary  # of the fit as it was
+    names = [f"setup.{one.name}" for one in moved.simulation.setup.parameters() if one.role == "place"]
+    drawn = training_simulation(moved.simulation, moved.noise, moved.pixel, (), moved.own).vary
+    for name in names:
+        middle = sum(slack[name]) / 2
+        assert drawn[name] == pytest.approx((middle - 0.0044, middle + 0.0044))
 
 
 def test_events_of_no_known_kind_are_warned_of(fit) -> None:

@@ -2,6 +2,7 @@
 
 from .captures import Calibration as Calibration
 from .captures import CaptureSet as CaptureSet
+from .captures import Own as Own
 from .captures import read_capture_set as read_capture_set
 from .event_fit import PixelFit as PixelFit
 from .event_fit import fit_pixel as fit_pixel
@@ -10,11 +11,12 @@ from .fit import Example as Example
 from .fit import SetupFit as SetupFit
 from .fit import Shown as Shown
 from .fit import fit_setup as fit_setup
-from .fit import steadied as steadied
+from .fit import training_simulation as training_simulation
 from .frame_model import FrameModel as FrameModel
 from .frame_model import FrameNoise as FrameNoise
 from .frame_model import LightLevel as LightLevel
 from .frame_model import fit_frame_noise as fit_frame_noise
+from .frame_model import steadied as steadied
 from .pixel_checks import refractory_of as refractory_of
 from .pixel_checks import tick_of as tick_of
 from .pixel_files import LitFile as LitFile

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import CaptureSet
-from evnlos.calibration.frame_model import FrameModel, working_shape
+from evnlos.calibration.captures import CaptureSet, working_shape
+from evnlos.calibration.frame_model import FrameModel
 from evnlos.calibration.transport_fit import (
     Residual,
     TransportFit,

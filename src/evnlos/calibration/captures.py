@@ -2,7 +2,7 @@
 
 - Settings: which captures are fitted and which held out, and where the search begins.
 - The captures: one setup, one camera, known motions, some of them held out.
-- What the fit of a wall works on: some pixels of some frames, and the targets as sparse images.
+- What each has of its own: light and motion that differ from those of the setup and of its notes.
 """
 
 from __future__ import annotations
@@ -10,20 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.data.capture import Capture, by_name, read_capture
-from evnlos.data.sampling import character_of, reduce_by_area
+from evnlos.data.sampling import character_of
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
-from evnlos.optics.facets import SparseImages
-from evnlos.optics.interpolation import point_samples
 from evnlos.scene import HandwritingGlyphs, LineMotion, Scene
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.types import Plane, derive_seed
+from evnlos.types import derive_seed
 
 
 def _rough_metal() -> Simulation:
@@ -102,6 +100,32 @@ FEWEST = 3
 """Fewest captures of a calibration: two to fit, one to check."""
 
 
+class Own(NamedTuple):
+    """What a capture has of its own beside the setup and its notes.
+
+    Args:
+        target: Brightness of its target over the setup's.
+        ambient: Its ambient light over the setup's.
+        ahead_m: How far its target is ahead of the stated place in the middle of its frames, metres.
+        speed: Its speed over the stated one.
+        target_growth: By how much the target's brightness grows from first frame to last, over its mean.
+        ambient_growth: By how much its ambient light does.
+    """
+
+    target: float = 1.0
+    ambient: float = 1.0
+    ahead_m: float = 0.0
+    speed: float = 1.0
+    target_growth: float = 0.0
+    ambient_growth: float = 0.0
+
+    def then(self, more: Own) -> Own:
+        """Return both together: this is taken off a capture, and of what is left there is more."""
+        ambient, ahead_m = self.ambient + self.target * (more.ambient - 1), self.ahead_m + more.ahead_m
+        growth = self.target_growth + more.target_growth, self.ambient_growth + more.ambient_growth
+        return Own(self.target * more.target, ambient, ahead_m, self.speed * more.speed, *growth)
+
+
 @dataclass(frozen=True)
 class CaptureSet:
     """Captures of one setup, in the order of their names.
@@ -109,13 +133,13 @@ class CaptureSet:
     Args:
         captures: The captures; the motion of each is known, and, where they are `labelled`, the target.
         target_size_m: Side of the targets, metres.
-        light: Target and ambient light of each over the setup's, which its frames no longer show; () is 1.
+        own: What each had of its own, which frames and motions no longer have; () is nothing.
         drifts: Whether target and ambient light of each count as unknown.
     """
 
     captures: tuple[Capture, ...]
     target_size_m: float = 0.08
-    light: tuple[tuple[float, float], ...] = ()
+    own: tuple[Own, ...] = ()
     drifts: bool = False
 
     @property
@@ -260,140 +284,48 @@ def _check_same_setup(first: Capture, other: Capture) -> None:
         raise DataError(f"{first.name} and {other.name} were rendered of different setups; {cure}")
 
 
-Array = NDArray[np.float64]
-
-_SATURATED = 0.995
-
-
-@dataclass(frozen=True, eq=False)
-class WallData:
-    """What the fit works on: some pixels of some frames, and the targets as sparse images.
+def moved_along(motion: LineMotion, ahead_m: float, speed: float, middle_s: float) -> LineMotion:
+    """Return a motion that is ahead of another in the middle of the frames, and faster.
 
     Args:
-        shape: Size (H, W) of the camera image, pixels.
-        columns: Columns of the pixels [P] in that image.
-        rows: Their rows [P].
-        seen: White levels [P, N].
-        capture: Capture of each frame [N].
-        group: Place of the target of each frame [N]: light that all captures share there is left out.
-        weight: Weight of each pixel's squares [P].
-        grid: Size (h, w) of the working images.
-        pixel: Number of each pixel in them [P].
-        places: Place (x, y) of the target in each frame [N, 2], metres.
-        plane: Cells of the targets' images.
-        images: The targets' images [N].
-        drifts: Whether light that is the same all over the frames of a capture is left out.
+        motion: The other.
+        ahead_m: Way along its direction, metres; below 0 it lags behind.
+        speed: Its speed over the other's.
+        middle_s: Instant of the middle of the frames, seconds.
     """
-
-    shape: tuple[int, int]
-    columns: Array
-    rows: Array
-    seen: Array
-    capture: NDArray[np.int64]
-    group: NDArray[np.int64]
-    weight: Array
-    grid: tuple[int, int]
-    pixel: NDArray[np.int64]
-    places: Array
-    plane: Plane
-    images: SparseImages
-    drifts: bool = False
-
-    def shared_removed(self, values: NDArray) -> NDArray:
-        """Return values [P, N, ...] without what frames of a group share, and what a capture has all over."""
-        out = np.array(values)
-        for k in np.unique(self.capture) if self.drifts else ():
-            out[:, self.capture == k] -= out[:, self.capture == k].mean(axis=(0, 1))
-        for g in range(int(self.group.max()) + 1):
-            rows = np.flatnonzero(self.group == g)
-            out[:, rows] -= out[:, rows].mean(axis=1, keepdims=True)
-        return out
-
-    def pixels(self, chosen: NDArray) -> WallData:
-        """Return the data of some of the pixels."""
-        names = ("columns", "rows", "seen", "weight", "pixel")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
-
-    def image(self, values: Array, fill: float) -> Array:
-        """Return values of the pixels [P] as a working image [h, w], `fill` where a pixel takes no part."""
-        out = np.full(self.grid[0] * self.grid[1], fill)
-        out[self.pixel] = values
-        return out.reshape(self.grid)
-
-    def monomials(self) -> Array:
-        """Return x, y, x^2, x y, y^2 over the image, [P, 5], each from -1 to 1."""
-        x = 2 * self.columns / (self.shape[1] - 1) - 1
-        y = 2 * self.rows / (self.shape[0] - 1) - 1
-        return np.stack([x, y, x * x, x * y, y * y], axis=1)
+    along = np.asarray(motion.direction) / np.hypot(*motion.direction)
+    late = motion.speed_m_s * (speed - 1) * (middle_s - motion.start_s)
+    start = np.asarray(motion.start_m) + (ahead_m - late) * along
+    return replace(motion, start_m=(float(start[0]), float(start[1])), speed_m_s=motion.speed_m_s * speed)
 
 
-def wall_data(
-    capture_set: CaptureSet,
-    columns: int,
-    plane: Plane,
-    *,
-    every: int = 4,
-    first: int | None = None,
-    checkered: bool = False,
-) -> WallData:
-    """Return frames of captures in the middles of larger pixels, and targets as images on a plane's cells.
+def relit(capture: Capture, levels: NDArray, peak: int) -> Capture:
+    """Return a capture with other light in its frames; what was saturated stays so.
 
     Args:
-        capture_set: The captures.
-        columns: Columns of the working images, at most the sensor's.
-        plane: Cells, over the whole travel.
-        every: Only every n-th frame of a capture takes part.
-        first: The first of them; None is the middle of the first n.
-        checkered: Whether only every second pixel takes part, in the pattern of a chessboard.
+        capture: The capture.
+        levels: Its frames in the other light, digital numbers that need not be whole, [N, H, W].
+        peak: Largest digital number.
     """
-    height, width = capture_set.shape
-    columns = min(columns, width)
-    grid = (max(8, round(columns * height / width)), columns) if columns < width else (height, width)
-    begin = every // 2 if first is None else first
-    frames, pictures, capture, places = [], [], [], []
-    for k, one in enumerate(capture_set.captures):
-        picked = np.arange(begin, len(one.frames), every)
-        means = reduce_by_area(one.frames[picked] / np.float32(capture_set.peak), grid)
-        frames.append(point_samples(means, (height / grid[0], width / grid[1])))
-        scene = capture_set.scenes[k]
-        place = scene.motion.position_m(capture_set.times_s(k)[picked])
-        pictures.append(scene.target.rasterise(plane, place).reshape(len(picked), -1))
-        capture.append(np.full(len(picked), k))
-        places.append(place)
-    seen, drawn = np.concatenate(frames), np.concatenate(pictures)
-    v, u = np.meshgrid(np.arange(grid[0]), np.arange(grid[1]), indexing="ij")
-    keep = ((u + v) % 2 == 0).ravel() if checkered else np.ones(u.size, bool)
-    keep &= (seen < _SATURATED).all(axis=0).ravel()
-    light = np.ascontiguousarray(seen.reshape(len(seen), -1).T[keep], dtype=np.float64)
-    level = light.mean(axis=1)
-    weight = 1 / (level + 0.05 * level.max() + 1e-9)
-    return WallData(
-        capture_set.shape,
-        ((u.ravel() + 0.5) * width / grid[1] - 0.5)[keep],
-        ((v.ravel() + 0.5) * height / grid[0] - 0.5)[keep],
-        light,
-        np.concatenate(capture),
-        grouped(np.concatenate(places), np.concatenate(capture)),
-        weight * (len(weight) / weight.sum()),
-        grid,
-        np.flatnonzero(keep),
-        np.concatenate(places),
-        plane,
-        SparseImages.of(drawn),
-        capture_set.drifts,
-    )
+    frames = np.rint(levels).clip(0, peak).astype(capture.frames.dtype)
+    return replace(capture, frames=np.where(capture.frames >= peak, capture.frames, frames))
 
 
-def grouped(places: Array, capture: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the group of each frame: those with targets within a millimetre, if most captures share places.
+def working_shape(shape: tuple[int, int], columns: int) -> tuple[int, int]:
+    """Return the size (h, w), w about `columns` and at most the sensor's, that keeps the sensor's shape best.
 
     Args:
-        places: Places of the targets [N, 2], metres.
-        capture: Capture of each frame [N].
+        shape: Sensor size (H, W), pixels.
+        columns: Wanted number of columns.
+
+    Example:
+        >>> working_shape((100, 160), 60)
+        (40, 64)
     """
-    keys = np.round(places / 1e-3).astype(np.int64)
-    _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    captures = len(np.unique(capture))
-    if captures < 4 or count.min() < max(3, captures / 2):
-        return np.zeros(len(places), np.int64)
-    return group.reshape(-1).astype(np.int64)
+    height, width = shape
+    if columns >= width:
+        return shape
+    candidates = [
+        (max(1, round(w * height / width)), w) for w in range(columns, min(width, columns * 4 // 3) + 1)
+    ]
+    return min(candidates, key=lambda s: (round(abs(s[0] * width / (s[1] * height) - 1), 6), s[1]))

@@ -92,8 +92,8 @@ def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[R
         note(f"light of capture {done + 1} of {len(chosen)}")
         capture, scene = capture_set.captures[k], capture_set.scenes[k]
         own = setup.resized(capture_set.shape)
-        if capture_set.light:
-            target, ambient = capture_set.light[k]
+        if capture_set.own:
+            target, ambient, *_ = capture_set.own[k]
             own = replace(own, gain=own.gain * target, ambient=own.ambient * ambient)
         wall = own.observe(scene)
         first, last = (float(t) * 1e-6 for t in capture.frame_times_us[[0, -1]])

@@ -17,12 +17,19 @@ from numpy.typing import NDArray
 
 from evnlos.analysis.identify import QUICK, identify
 from evnlos.calibration.blind_calibration import fit_blind
-from evnlos.calibration.captures import Calibration, CaptureSet, read_capture_set
+from evnlos.calibration.captures import Calibration, CaptureSet, Own, read_capture_set
 from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
-from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
+from evnlos.calibration.frame_model import (
+    EVERY,
+    FrameModel,
+    FrameNoise,
+    coarse_shape,
+    fit_frame_noise,
+    own_factors,
+    steadied,
+)
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
-from evnlos.calibration.wall_fit import relit
 from evnlos.calibration.wall_search import check_measured, curvature, fit_wall, frame_doubt
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
@@ -41,8 +48,6 @@ _WITHOUT_PATTERN = "frames held out, without pattern"
 _MOST_OF_NOISE = 1.1
 _MOST_UNEXPLAINED = {"known": 0.05, "unknown": 0.2}  # targets that nobody knows are never expected exactly
 
-_COARSER, _EVERY = 4, 2  # pixels and frames of one that the light of captures is told from
-_LEAST_CHANGE, _LEAST_CHANGE_DN = 0.02, 0.1  # of light from capture to capture: of itself; DN of 8 bits
 _STEADIER = 0.9  # of what is left that another fit has to reach
 _MOST_STEADYING = 3  # fits of captures that were steadied: each tells their light better
 _DOUBTFUL, _STRAY = 2.0, 3.0  # times what captures keep in the median: with the capture in the fit, without it
@@ -115,7 +120,7 @@ class SetupFit:
         ink: Where the known targets have their ink.
         shown: What one frame shows of a target, whatever the method; None where that is not known.
         curved: What `curvature` says of the frames held out; zeros where it can only be the wall's.
-        light: Target and ambient light of each capture over the setup's; () where they are the same in all.
+        own: What each capture has of its own beside the setup and its notes; () where nothing differs.
         strays: What captures that were left out keep, over the median of all: they do not fit the others.
     """
 
@@ -135,7 +140,7 @@ class SetupFit:
     ink: Ink = field(default_factory=Ink)
     shown: Shown | None = None
     curved: tuple[float, float] = (0.0, 0.0)
-    light: tuple[tuple[float, float], ...] = ()
+    own: tuple[Own, ...] = ()
     strays: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -150,8 +155,19 @@ class SetupFit:
     @property
     def light_words(self) -> tuple[str, str]:
         """How target and ambient light differ from capture to capture; empty where they do not."""
-        gain, ambient = (_range_words(own) for own in zip(*self.light, strict=True)) if self.light else ("", "")
+        gain, ambient = (_range_words([getattr(one, n) for one in self.own]) for n in ("target", "ambient"))
         return gain, ambient
+
+    @property
+    def motion_words(self) -> list[str]:
+        """How far targets were from where notes place them, a line; none where they were there."""
+        speeds = [100 * (one.speed - 1) for one in self.own]
+        if not any(speeds):
+            return []
+        far, name = max((abs(one.ahead_m), name) for one, name in zip(self.own, self.captures, strict=True))
+        what = f"targets are up to {1e3 * far:.1f} mm beside their stated places ({name} most), their speeds"
+        what += f" {min(speeds):+.1f} to {max(speeds):+.1f} % off"
+        return [f"{what}; the fit takes that off (calibration.json says each): mend `motion` in capture.yaml"]
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -188,7 +204,7 @@ class SetupFit:
 
 def _range_words(own: Sequence[float]) -> str:
     """Return how factors of captures differ; empty where they do not."""
-    low, high = min(own), max(own)
+    low, high = min(own, default=1.0), max(own, default=1.0)
     return f"{low:.2f} to {high:.2f} times it from capture to capture" if high > low else ""
 
 
@@ -294,7 +310,7 @@ def fit_setup(
         seen_targets = [*zip(fit.names, fit.scenes, strict=True), *zip(held.names, held.scenes, strict=True)]
         side = simulation.glyphs.target_plane.size_m
         known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
-    training = training_simulation(simulation, noise, pixel, shown, (*fit.light, *held.light))
+    training = training_simulation(simulation, noise, pixel, shown, (*fit.own, *held.own))
     result = SetupFit(
         simulation,
         training,
@@ -312,64 +328,11 @@ def fit_setup(
         Ink.of(shown),
         Shown.by(simulation),
         curved if curved[0] < 0 or about.tone or about.log else (0.0, 0.0),  # else it is the wall's
-        (*fit.light, *held.light),
+        (*fit.own, *held.own),
         strays,
     )
     progress(Step("calibrate", len(stages), len(stages), "stages"))
     return result
-
-
-def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSet, CaptureSet] | None:
-    """Return captures without what the light of each has more or less than the setup's.
-
-    Daylight, lamps elsewhere in the room, the lamp of the target and the exposure change from one recording to
-    the next; what is fitted takes them to be the same in all.
-
-    Args:
-        fit: Captures that were fitted.
-        held: Captures that were held out.
-        setup: What was fitted to them.
-
-    Returns:
-        The same captures; None where they do not differ by what frames show.
-    """
-    factors = _light_changes(fit, held, setup)
-    if factors is None:
-        return None
-    around, found = setup.ambient_light(fit.shape).numpy(), list[CaptureSet]()
-    middle = np.median(np.concatenate(factors), axis=0)  # of target and ambient light
-    for one, own in zip((fit, held), factors, strict=True):
-        parts, captures = (own / middle).clip(0), []
-        for capture, (target, ambient) in zip(one.captures, parts.tolist(), strict=True):
-            usual = np.float32(middle[1] * one.peak) * around
-            level = (capture.frames - np.float32(ambient) * usual) / np.float32(target) + usual
-            captures.append(relit(capture, level, one.peak))
-        before = np.array(one.light or [(1.0, 1.0)] * len(parts))
-        light = before * parts
-        light[:, 1] = before[:, 1] + before[:, 0] * (parts[:, 1] - 1)
-        found.append(replace(one, captures=tuple(captures), light=tuple(map(tuple, light.tolist()))))
-    return found[0], found[1]
-
-
-def _low(captures: CaptureSet) -> tuple[int, int]:
-    """Return the size (h, w) at which captures are told from each other."""
-    height, width = captures.shape
-    return max(8, round(height / _COARSER)), max(8, round(width / _COARSER))
-
-
-def _light_changes(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[NDArray[np.float64]] | None:
-    """Return target and ambient light [captures, 2] over the setup's; None where frames show no change.
-
-    Of what does not change by more than they show, all captures have the median.
-    """
-    factors = [FrameModel(one, _low(fit), _EVERY).light_factors(setup) for one in (fit, held)]
-    every = np.concatenate(factors)
-    levels = np.array([setup.gain, float(setup.ambient_light(fit.shape).mean())])
-    spread, middle = every.std(axis=0), np.median(every, axis=0)
-    is_seen = (spread > _LEAST_CHANGE) & (spread * levels * 255 > _LEAST_CHANGE_DN) & (middle > 0)
-    if not is_seen.any() or not (every[:, 0] > 0).all():
-        return None
-    return [np.where(is_seen, one, middle) for one in factors]
 
 
 def _fit_any(
@@ -397,7 +360,7 @@ def _fit_any(
     strays = {name: kept for name, kept in _kept(fit, held, again.setup).items() if kept > _STRAY}
     if not strays:
         return optics, fit, held, {}
-    if fit.light:  # it was told with strays among the captures
+    if fit.own:  # it was told with strays among the captures
         fit, held = (_without(one, strays) for one in recorded)
         optics, fit, held, more = _fit_any(settings, fit, held, start)
         return optics, fit, held, strays | more
@@ -410,15 +373,18 @@ def _fit_steadied(
     """Return the fit of a wall and the captures behind it, `steadied` where that helps."""
 
     def left(setup: Setup, other: CaptureSet) -> float:
-        model = FrameModel(other, other.shape, _EVERY)
+        model = FrameModel(other, other.shape, EVERY)
         return model.left(model.predict(setup))
 
     optics = wall(fit, held)
-    if _light_changes(fit, held, optics.setup) is None:
+    found = own_factors(fit, held, optics.setup)
+    if found is None:
         return optics, fit, held
-    note("light that differs from capture to capture")
-    steady, again = (fit, held), optics
-    there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
+    note("what differs from capture to capture")
+    steady, again, there = (fit, held), optics, optics.setup
+    usual = np.concatenate(found)[:, [0, 1]]
+    if np.ptp(usual, axis=0).any():  # light that differs spoils the fit of all
+        there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
     for _ in range(_MOST_STEADYING):
         steadier = steadied(*steady, there)
         if steadier is None:
@@ -433,7 +399,7 @@ def _kept(captures: CaptureSet, others: CaptureSet, setup: Setup) -> dict[str, f
     """Return what a fit leaves of each capture, over the median of all."""
     kept = dict[str, float]()
     for one in (captures, others):
-        model, of = FrameModel(one, _low(one), _EVERY), one.frame_of(_EVERY)
+        model, of = FrameModel(one, coarse_shape(one), EVERY), one.frame_of(EVERY)
         squares = ((model.frames - model.predict(setup)) * model.weight).square().mean(dim=(1, 2)).numpy()
         kept |= {name: math.sqrt(squares[of == k].mean()) for k, name in enumerate(one.names)}
     middle = float(np.median(list(kept.values())))
@@ -443,8 +409,8 @@ def _kept(captures: CaptureSet, others: CaptureSet, setup: Setup) -> dict[str, f
 def _without(captures: CaptureSet, names: Collection[str]) -> CaptureSet:
     """Return the captures but some."""
     stay = [k for k, name in enumerate(captures.names) if name not in names]
-    light = tuple(captures.light[k] for k in stay) if captures.light else ()
-    return replace(captures, captures=tuple(captures.captures[k] for k in stay), light=light)
+    own = tuple(captures.own[k] for k in stay) if captures.own else ()
+    return replace(captures, captures=tuple(captures.captures[k] for k in stay), own=own)
 
 
 def _is_any(settings: Calibration, fit: CaptureSet) -> bool:
@@ -533,7 +499,7 @@ def training_simulation(
     noise: FrameNoise,
     pixel: PixelFit | None,
     shown: Sequence[Target],
-    light: Sequence[tuple[float, float]] = (),
+    own: Sequence[Own] = (),
 ) -> Simulation:
     """Return the simulation to pre-train on: the fitted one, varied from object to object.
 
@@ -545,18 +511,19 @@ def training_simulation(
         noise: The frame camera's noise.
         pixel: The fitted event pixel; None where only frames were fitted.
         shown: The known targets; none where they are unknown.
-        light: Target and ambient light of the captures over the fitted ones.
+        own: What the captures have of their own.
     """
     glyphs = fitted.glyphs
     if isinstance(glyphs, HandwritingGlyphs):
         glyphs = written_alike(replace(glyphs, strokes=Strokes("both")), shown)
     vary = fitted.vary | ranges_around(fitted, _SPREAD)
-    for name, own in zip(("setup.gain", "setup.ambient"), zip(*light, strict=True), strict=False):
+    for name, factors in zip(("setup.gain", "setup.ambient"), zip(*own, strict=True), strict=False):
         low, high = vary[name]
-        vary[name] = (low * min(1.0, *own), high * max(1.0, *own))
+        vary[name] = (low * min(1.0, *factors), high * max(1.0, *factors))
+    slack = max([_SLACK_M, *(abs(one.ahead_m) for one in own)])
     for one in fitted.setup.parameters():
         if one.role == "place":
-            vary[f"setup.{one.name}"] = (one.value - _SLACK_M, one.value + _SLACK_M)
+            vary[f"setup.{one.name}"] = (one.value - slack, one.value + slack)
     if pixel is not None:
         if pixel.cutoff_range_hz is not None:
             vary["setup.pixel.cutoff_hz"] = pixel.cutoff_range_hz

@@ -6,19 +6,26 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import CaptureSet
+from evnlos.calibration.captures import CaptureSet, Own, moved_along, relit
 from evnlos.cameras import FrameCamera, FrameCameraSettings, LogCodes, LogFrameCamera
+from evnlos.data.capture import Capture
 from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.setups import Setup
 from evnlos.types import Plane
+
+_AHEAD_M, _FASTER = 1e-3, 0.02  # steps of the derivatives by place and speed
+_COARSER, EVERY = 4, 2  # pixels and frames of one that the light of captures is told from
+_LEAST_CHANGE, _LEAST_CHANGE_DN = 0.02, 0.1  # of light from capture to capture: of itself; DN of 8 bits
+_LEAST_WAY_M = 6e-4  # of places from capture to capture: walls of other kinds feign 1e-4 to 4e-4
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class FrameModel:
         if every < 1:
             raise ConfigError(f"every is {every}; take every frame (1) or every n-th")
         self.shape = shape
-        self._scenes = capture_set.scenes
+        self._scenes, self._motions = capture_set.scenes, capture_set.motions
         self._times = [capture_set.times_s(k)[::every] for k in range(len(capture_set.captures))]
         raw = np.concatenate([capture.frames[::every] for capture in capture_set.captures])
         reduced = reduce_by_area(raw / np.float32(capture_set.peak), shape)
@@ -123,16 +130,41 @@ class FrameModel:
         """Return the frames that the setup, with its own gain and ambient light, predicts, [N, h, w]."""
         return setup.gain * self.light(setup) + setup.ambient_light(self.shape)
 
-    def light_factors(self, setup: Setup) -> NDArray[np.float64]:
-        """Return target and ambient light of each capture over the setup's, [captures, 2], by least squares."""
-        around, counts, found = setup.ambient_light(self.shape), [len(one) for one in self._times], []
-        parts = (self.light(setup).split(counts), self.frames.split(counts), self.weight.split(counts))
-        for light, seen, weight in zip(*parts, strict=True):
-            both = torch.stack([setup.gain * light, around.to(light).expand_as(light)]).double()
-            normal = torch.einsum("anhw,bnhw,nhw->ab", both, both, weight.double())
-            right = torch.einsum("anhw,nhw,nhw->a", both, seen.double(), weight.double())
-            found.append(torch.linalg.lstsq(normal, right[:, None]).solution[:, 0].numpy())
-        return np.stack(found)
+    def own(self, setup: Setup) -> NDArray[np.float64]:
+        """Return what each capture has of its own, [captures, 6], in the order of `Own`.
+
+        Least squares, in place and speed to first order: a L(p + d) = a L + a d L'.
+        """
+        light, around = setup.gain * self.light(setup), setup.ambient_light(self.shape)
+        counts, found = [len(one) for one in self._times], []
+        late = torch.cat([torch.linspace(-0.5, 0.5, n) if n > 1 else torch.zeros(n) for n in counts])
+        columns = [light, around.to(light).expand_as(light)]
+        for ahead_m, faster in ((_AHEAD_M, 0.0), (0.0, _FASTER)):
+            there = setup.gain * self._moved(ahead_m, 1 + faster).light(setup)
+            columns.append((there - light) / (ahead_m + faster))
+        columns += [late[:, None, None] * one for one in columns[:2]]
+        split = (torch.stack(columns).split(counts, 1), self.frames.split(counts), self.weight.split(counts))
+        for parts, seen, weight in zip(*split, strict=True):
+            scale = parts.double().square().mean(dim=(1, 2, 3)).sqrt() + 1e-30
+            each = parts.double() / scale[:, None, None, None]
+            normal = torch.einsum("anhw,bnhw,nhw->ab", each, each, weight.double())
+            right = torch.einsum("anhw,nhw,nhw->a", each, seen.double(), weight.double())
+            target, ambient, *more = (
+                torch.linalg.lstsq(normal, right[:, None]).solution[:, 0] / scale
+            ).tolist()
+            ahead, faster, fade, drift = more
+            grown = fade / target, drift / ambient if ambient else 0.0
+            found.append([target, ambient, ahead / target, 1 + faster / target, *grown])
+        return np.array(found)
+
+    def _moved(self, ahead_m: float, speed: float) -> FrameModel:
+        """Return the model of the same frames with targets ahead of their places, and faster."""
+        other, scenes = copy(self), []
+        for scene, motion, times in zip(self._scenes, self._motions, self._times, strict=True):
+            moved = moved_along(motion, ahead_m, speed, (times[0] + times[-1]) / 2)
+            scenes.append(replace(scene, motion=moved))
+        other._scenes, other._drawn = tuple(scenes), {}
+        return other
 
     def _along(self, setup: Setup) -> torch.Tensor | float:
         """Return the light of what moves along with the targets, [N, h, w], or nothing."""
@@ -162,6 +194,80 @@ class FrameModel:
         return self._drawn[plane]
 
 
+def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSet, CaptureSet] | None:
+    """Return captures without what each has of its own beside the setup and its notes.
+
+    Daylight, lamps elsewhere in the room, the lamp of the target and the exposure change from one recording to
+    the next and in its course, and a target that starts by hand is never where its notes say; what is fitted
+    takes light and motion to be the same in all.
+
+    Args:
+        fit: Captures that were fitted.
+        held: Captures that were held out.
+        setup: What was fitted to them.
+
+    Returns:
+        The same captures; None where they do not differ by what frames show.
+    """
+    factors = own_factors(fit, held, setup)
+    if factors is None:
+        return None
+    around, found = setup.ambient_light(fit.shape).numpy(), list[CaptureSet]()
+    middle = np.median(np.concatenate(factors)[:, 1])  # of the ambient light
+    for one, every in zip((fit, held), factors, strict=True):
+        captures, told = list[Capture](), list[Own]()
+        usual = np.float32(middle * one.peak) * around
+        for k, (capture, (target, ambient, *other)) in enumerate(
+            zip(one.captures, every.tolist(), strict=True)
+        ):
+            own = Own(target, ambient / middle, *other)
+            late = np.linspace(-0.5, 0.5, len(capture.frames), dtype=np.float32)[:, None, None]
+            lit = own.target * (1 + own.target_growth * late)
+            level = (capture.frames - own.ambient * (1 + own.ambient_growth * late) * usual) / lit + usual
+            motion, times = one.motions[k], one.times_s(k)
+            moved = moved_along(motion, own.ahead_m, own.speed, float(times[0] + times[-1]) / 2)
+            assert capture.info.motion is not None
+            noted = replace(capture.info.motion, start_m=moved.start_m, speed_m_s=moved.speed_m_s)
+            info = replace(capture.info, motion=noted)
+            captures.append(replace(relit(capture, level, one.peak), info=info))
+            told.append(one.own[k].then(own) if one.own else own)
+        found.append(replace(one, captures=tuple(captures), own=tuple(told)))
+    return found[0], found[1]
+
+
+def own_factors(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[NDArray[np.float64]] | None:
+    """Return what each has of its own [captures, 6], in the order of `Own`; None where frames show nothing.
+
+    What all have alike is the setup's: a median, the middle of the places. Ambient light stays beside the
+    setup's.
+    """
+    factors = [FrameModel(one, coarse_shape(fit), EVERY).own(setup) for one in (fit, held)]
+    every, motions = np.concatenate(factors), (*fit.motions, *held.motions)
+    times = [one.times_s(k) for one in (fit, held) for k in range(len(one.captures))]
+    along = np.array([np.asarray(one.direction) / np.hypot(*one.direction) for one in motions])
+    ways = np.array([one.speed_m_s * (t[-1] - t[0]) for one, t in zip(motions, times, strict=True)])
+    every[:, 2] -= along @ np.linalg.lstsq(along, every[:, 2], rcond=None)[0]
+    middle = np.median(every, axis=0)
+    every[:, [0, 3]] /= middle[[0, 3]]
+    every[:, 4:] -= middle[4:]
+    levels = np.array([setup.gain, float(setup.ambient_light(fit.shape).mean())] * 2)
+    light, spread = [0, 1, 4, 5], every[:, [0, 1, 4, 5]].std(axis=0)
+    is_seen = np.ones(6, dtype=bool)
+    is_seen[light] = (spread > _LEAST_CHANGE) & (spread * levels * 255 > _LEAST_CHANGE_DN)
+    away = np.hypot(every[:, 2], (every[:, 3] - 1) * ways / 2)
+    is_seen[2:4] = np.sqrt(np.mean(away**2)) > _LEAST_WAY_M
+    if not is_seen.any() or not (middle[:2] > 0).all() or not (every[:, 0] > 0).all():
+        return None
+    every = np.where(is_seen, every, [1.0, middle[1], 0.0, 1.0, 0.0, 0.0])
+    return np.split(every, [len(factors[0])])
+
+
+def coarse_shape(captures: CaptureSet) -> tuple[int, int]:
+    """Return the size (h, w) at which captures are told from each other."""
+    height, width = captures.shape
+    return max(8, round(height / _COARSER)), max(8, round(width / _COARSER))
+
+
 def relative_residual(residual: torch.Tensor, frames: torch.Tensor, weight: torch.Tensor) -> float:
     """Return sqrt(mean residual^2) over the standard deviation of the frames, over the pixels that take part.
 
@@ -183,26 +289,6 @@ def relative_residual(residual: torch.Tensor, frames: torch.Tensor, weight: torc
 def _inner(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the sum of a b over [N, h, w], gathered in float64."""
     return torch.einsum("nhw,nhw->n", a, b).double().sum()
-
-
-def working_shape(shape: tuple[int, int], columns: int) -> tuple[int, int]:
-    """Return the size (h, w), w about `columns` and at most the sensor's, that keeps the sensor's shape best.
-
-    Args:
-        shape: Sensor size (H, W), pixels.
-        columns: Wanted number of columns.
-
-    Example:
-        >>> working_shape((100, 160), 60)
-        (40, 64)
-    """
-    height, width = shape
-    if columns >= width:
-        return shape
-    candidates = [
-        (max(1, round(w * height / width)), w) for w in range(columns, min(width, columns * 4 // 3) + 1)
-    ]
-    return min(candidates, key=lambda s: (round(abs(s[0] * width / (s[1] * height) - 1), 6), s[1]))
 
 
 def fitting_strip(setup: Setup, capture_set: CaptureSet) -> Setup:

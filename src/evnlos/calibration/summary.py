@@ -129,7 +129,7 @@ def warnings_of(fit: SetupFit) -> list[str]:
     Args:
         fit: The calibration.
     """
-    found, cure = fit.stray_words, f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
+    found, cure = fit.stray_words + fit.motion_words, f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
     if on_bound := fit.optics.on_bound:
         names = ", ".join(f"setup.{name} ({value:.4g})" for name, value in on_bound.items())
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
@@ -239,10 +239,8 @@ def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
         "warnings": warnings_of(fit),
         "expectation": expectation(fit),
         "shown": None if fit.shown is None else asdict(fit.shown),
-        "steps": {
-            name: {"explained": share, "kept": kept}
-            for name, (share, kept) in fit.simulation.setup.steps().items()
-        },
+        "own": {name: own._asdict() for name, own in zip(fit.captures, fit.own, strict=False)},
+        "steps": {n: {"explained": e, "kept": k} for n, (e, k) in fit.simulation.setup.steps().items()},
         "residuals": {
             name: {"before": round(r.before, 5), "after": round(r.after, 5), "noise": round(r.noise, 5)}
             for name, r in fit.residuals.items()

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Array, CaptureSet
-from evnlos.calibration.frame_model import FrameModel, fitting_strip, working_shape
+from evnlos.calibration.captures import CaptureSet, working_shape
+from evnlos.calibration.frame_model import FrameModel, fitting_strip
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import note
 from evnlos.setups import Parameter, Setup
@@ -42,6 +42,7 @@ class Residual:
         return math.sqrt(max(self.after**2 - self.noise**2, 0.0))
 
 
+Array = NDArray[np.float64]
 Residuals = Callable[[Array], torch.Tensor]
 """From the parameters [P] to the residual, any shape."""
 

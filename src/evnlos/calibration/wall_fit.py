@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Array, CaptureSet, WallData, wall_data
+from evnlos.calibration.captures import CaptureSet, relit
 from evnlos.calibration.transport_fit import BLOCKS, scatter_of
-from evnlos.data import Capture
+from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError
 from evnlos.machine import note
 from evnlos.optics.facets import (
@@ -28,6 +28,7 @@ from evnlos.optics.facets import (
     Pose,
     Seen,
     SlopeTable,
+    SparseImages,
     carry_facets,
     carry_lobes,
     facet_slopes,
@@ -36,8 +37,11 @@ from evnlos.optics.facets import (
     seen_points,
     target_cells,
 )
+from evnlos.optics.interpolation import point_samples
 from evnlos.optics.radiometric import torchs_threads
 from evnlos.types import Plane
+
+Array = NDArray[np.float64]
 
 LOBES = np.array(
     [(a, a * r) for a in (0.02, 0.035, 0.06, 0.10, 0.17, 0.3) for r in (0.6, 1.0, 1.6)], dtype=np.float64
@@ -52,7 +56,142 @@ _MATTE = 10.0  # of the matte part, in units that count beside the facets
 _CHUNK = 400  # pixels whose derivatives are held at a time
 _TRIALS = 6
 _DIMMEST_BRIGHTEST = (0.2, 5.0)  # targets of captures beside the mean of all
+_SATURATED = 0.995
 _TOLERANCE = 1e-3  # a search ends when a step lowers its cost by a smaller fraction
+
+
+@dataclass(frozen=True, eq=False)
+class WallData:
+    """What the fit works on: some pixels of some frames, and the targets as sparse images.
+
+    Args:
+        shape: Size (H, W) of the camera image, pixels.
+        columns: Columns of the pixels [P] in that image.
+        rows: Their rows [P].
+        seen: White levels [P, N].
+        capture: Capture of each frame [N].
+        group: Place of the target of each frame [N]: light that all captures share there is left out.
+        weight: Weight of each pixel's squares [P].
+        grid: Size (h, w) of the working images.
+        pixel: Number of each pixel in them [P].
+        places: Place (x, y) of the target in each frame [N, 2], metres.
+        plane: Cells of the targets' images.
+        images: The targets' images [N].
+        drifts: Whether light that is the same all over the frames of a capture is left out.
+    """
+
+    shape: tuple[int, int]
+    columns: Array
+    rows: Array
+    seen: Array
+    capture: NDArray[np.int64]
+    group: NDArray[np.int64]
+    weight: Array
+    grid: tuple[int, int]
+    pixel: NDArray[np.int64]
+    places: Array
+    plane: Plane
+    images: SparseImages
+    drifts: bool = False
+
+    def shared_removed(self, values: NDArray) -> NDArray:
+        """Return values [P, N, ...] without what frames of a group share, and what a capture has all over."""
+        out = np.array(values)
+        for k in np.unique(self.capture) if self.drifts else ():
+            out[:, self.capture == k] -= out[:, self.capture == k].mean(axis=(0, 1))
+        for g in range(int(self.group.max()) + 1):
+            rows = np.flatnonzero(self.group == g)
+            out[:, rows] -= out[:, rows].mean(axis=1, keepdims=True)
+        return out
+
+    def pixels(self, chosen: NDArray) -> WallData:
+        """Return the data of some of the pixels."""
+        names = ("columns", "rows", "seen", "weight", "pixel")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+    def image(self, values: Array, fill: float) -> Array:
+        """Return values of the pixels [P] as a working image [h, w], `fill` where a pixel takes no part."""
+        out = np.full(self.grid[0] * self.grid[1], fill)
+        out[self.pixel] = values
+        return out.reshape(self.grid)
+
+    def monomials(self) -> Array:
+        """Return x, y, x^2, x y, y^2 over the image, [P, 5], each from -1 to 1."""
+        x = 2 * self.columns / (self.shape[1] - 1) - 1
+        y = 2 * self.rows / (self.shape[0] - 1) - 1
+        return np.stack([x, y, x * x, x * y, y * y], axis=1)
+
+
+def wall_data(
+    capture_set: CaptureSet,
+    columns: int,
+    plane: Plane,
+    *,
+    every: int = 4,
+    first: int | None = None,
+    checkered: bool = False,
+) -> WallData:
+    """Return frames of captures in the middles of larger pixels, and targets as images on a plane's cells.
+
+    Args:
+        capture_set: The captures.
+        columns: Columns of the working images, at most the sensor's.
+        plane: Cells, over the whole travel.
+        every: Only every n-th frame of a capture takes part.
+        first: The first of them; None is the middle of the first n.
+        checkered: Whether only every second pixel takes part, in the pattern of a chessboard.
+    """
+    height, width = capture_set.shape
+    columns = min(columns, width)
+    grid = (max(8, round(columns * height / width)), columns) if columns < width else (height, width)
+    begin = every // 2 if first is None else first
+    frames, pictures, capture, places = [], [], [], []
+    for k, one in enumerate(capture_set.captures):
+        picked = np.arange(begin, len(one.frames), every)
+        means = reduce_by_area(one.frames[picked] / np.float32(capture_set.peak), grid)
+        frames.append(point_samples(means, (height / grid[0], width / grid[1])))
+        scene = capture_set.scenes[k]
+        place = scene.motion.position_m(capture_set.times_s(k)[picked])
+        pictures.append(scene.target.rasterise(plane, place).reshape(len(picked), -1))
+        capture.append(np.full(len(picked), k))
+        places.append(place)
+    seen, drawn = np.concatenate(frames), np.concatenate(pictures)
+    v, u = np.meshgrid(np.arange(grid[0]), np.arange(grid[1]), indexing="ij")
+    keep = ((u + v) % 2 == 0).ravel() if checkered else np.ones(u.size, bool)
+    keep &= (seen < _SATURATED).all(axis=0).ravel()
+    light = np.ascontiguousarray(seen.reshape(len(seen), -1).T[keep], dtype=np.float64)
+    level = light.mean(axis=1)
+    weight = 1 / (level + 0.05 * level.max() + 1e-9)
+    return WallData(
+        capture_set.shape,
+        ((u.ravel() + 0.5) * width / grid[1] - 0.5)[keep],
+        ((v.ravel() + 0.5) * height / grid[0] - 0.5)[keep],
+        light,
+        np.concatenate(capture),
+        grouped(np.concatenate(places), np.concatenate(capture)),
+        weight * (len(weight) / weight.sum()),
+        grid,
+        np.flatnonzero(keep),
+        np.concatenate(places),
+        plane,
+        SparseImages.of(drawn),
+        capture_set.drifts,
+    )
+
+
+def grouped(places: Array, capture: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the group of each frame: those with targets within a millimetre, if most captures share places.
+
+    Args:
+        places: Places of the targets [N, 2], metres.
+        capture: Capture of each frame [N].
+    """
+    keys = np.round(places / 1e-3).astype(np.int64)
+    _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    captures = len(np.unique(capture))
+    if captures < 4 or count.min() < max(3, captures / 2):
+        return np.zeros(len(places), np.int64)
+    return group.reshape(-1).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -289,18 +428,6 @@ def evenly_lit(captures: CaptureSet, state: WallState, plane: Plane) -> CaptureS
     for one, gain in zip(captures.captures, own.tolist(), strict=True):
         frames.append(relit(one, one.frames / np.float32(gain), captures.peak))
     return replace(captures, captures=tuple(frames))
-
-
-def relit(capture: Capture, levels: NDArray, peak: int) -> Capture:
-    """Return a capture with other light in its frames; what was saturated stays so.
-
-    Args:
-        capture: The capture.
-        levels: Its frames in the other light, digital numbers that need not be whole, [N, H, W].
-        peak: Largest digital number.
-    """
-    frames = np.rint(levels).clip(0, peak).astype(capture.frames.dtype)
-    return replace(capture, frames=np.where(capture.frames >= peak, capture.frames, frames))
 
 
 def refine(

@@ -9,18 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from evnlos.calibration.captures import CaptureSet, WallData, wall_data
-from evnlos.calibration.wall_fit import WallState
+from evnlos.calibration.captures import CaptureSet
+from evnlos.calibration.wall_fit import Array, WallData, WallState, wall_data
 from evnlos.data.sampling import reduce_by_area
 from evnlos.machine import note
 from evnlos.optics.facets import MASKING, fill_facets, seen_points, target_cells
 from evnlos.optics.radiometric import torchs_threads
 from evnlos.setups.files import AboutWall, FittedWall
 from evnlos.types import Plane
-
-Array = NDArray[np.float64]
 
 _COLUMNS = 160  # of the working images: finer texture is the fixed pattern's
 _COARSE = 64  # of those that the correction of the operator is estimated on

@@ -20,18 +20,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Array, CaptureSet, WallData, wall_data
+from evnlos.calibration.captures import CaptureSet
 from evnlos.calibration.frame_model import FrameNoise
 from evnlos.calibration.transport_fit import TransportFit
 from evnlos.calibration.wall_fit import (
     FREEDOMS,
+    Array,
     Freedom,
     Progress,
+    WallData,
     WallState,
     evenly_lit,
     refine,
     start_at,
     uncertainty,
+    wall_data,
 )
 from evnlos.calibration.wall_rest import WallRest, rest_of
 from evnlos.data.sampling import reduce_by_area
