@@ -580,7 +580,7 @@ def test_targets_started_by_hand_are_fitted_to_the_noise(recorded) -> None:
     assert left.after < 1.1 * left.noise and found.strays == {}
     told = dict(zip(found.captures, found.own, strict=True))
     speeds = np.array([told[folder.name].speed for folder in recorded]) * faster
-    assert speeds / np.median(speeds) == pytest.approx(np.ones(len(recorded)), abs=2e-3)
+    assert speeds / np.median(speeds) == pytest.approx(np.ones(len(recorded)), abs=5e-3)
 
 
 @pytest.mark.thorough

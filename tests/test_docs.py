@@ -229,8 +229,8 @@ def test_no_page_to_start_with_asks_for_a_compiler() -> None:
 
 
 _ROWS = {
-    "E2E, its positions aligned and averaged (the strongest E2E)": "e2e-single-positions-averaged",
-    "calibrated simulation only, whole sequence": "simulation-only-sequence",
+    "strongest E2E, its positions averaged": "e2e-single-positions-averaged",
+    "simulation only, whole sequence": "simulation-only-sequence",
     "EPNP, whole sequence": "epnp-sequence",
 }
 
