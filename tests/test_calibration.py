@@ -597,6 +597,18 @@ def test_ambient_light_that_changes_while_captures_are_recorded_is_taken_off(rec
     assert left.after < 1.1 * left.noise and found.motion_words == []
 
 
+def test_what_is_clipped_below_white_counts_as_saturated(recorded) -> None:
+    top = 134
+    for folder in recorded[:3]:
+        for path in (folder / "frames").iterdir():
+            Image.fromarray(np.asarray(Image.open(path)).clip(max=top)).save(path)
+    fit, held = read_capture_set(recorded[:3], holdout=("B",))
+    for captures in (fit, held):
+        assert set(np.unique(captures.frames()[captures.frames() >= top])) == {255}
+        weight = FrameModel(captures, captures.shape).weight.numpy()
+        np.testing.assert_array_equal(weight == 0, captures.frames() == 255)
+
+
 @pytest.mark.thorough
 def test_captures_whose_labels_were_exchanged_are_left_out_and_named(recorded) -> None:
     one, other = (folder / "target.png" for folder in recorded if folder.name in ("near_H", "near_L"))

@@ -23,7 +23,7 @@ from evnlos.data.capture_info import (
     read_capture_info,
 )
 from evnlos.data.clocks import expected_counts
-from evnlos.data.frames import from_start
+from evnlos.data.frames import clipped_at, from_start
 from evnlos.data.lab import Lab, render_captures
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs
@@ -54,6 +54,14 @@ def test_a_good_shot_is_called_good(capture) -> None:
 def test_light_that_is_wrong_is_named(capture) -> None:
     bright = replace(capture, frames=np.maximum(capture.frames, 255).astype(np.uint8))
     assert levels(bright)["saturation"] == "bad" and "exposure" in cures(bright)["saturation"]
+    top = int(np.percentile(capture.frames, 98))  # a sensor that saturates below the white of its files
+    early = next(
+        one
+        for one in check_capture(replace(capture, frames=capture.frames.clip(max=top)))
+        if one.level != "good"
+    )
+    assert early.what == "saturation" and early.found.endswith(f"clipped at {top}")
+    assert clipped_at(capture.frames, 255) == clipped_at(bright.frames, 255) == 255
     dim = replace(capture, frames=(capture.frames // 100).astype(np.uint8))
     assert levels(dim)["brightness"] == "bad" and "lengthen" in cures(dim)["brightness"]
 

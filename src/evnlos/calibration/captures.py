@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.data.capture import Capture, by_name, read_capture
+from evnlos.data.frames import clipped_at
 from evnlos.data.sampling import character_of
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
@@ -215,7 +216,7 @@ def read_capture_set(
         raise DataError(
             f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one setup"
         )
-    captures = [read_capture(paths[name], needs_events=False) for name in chosen]
+    captures = [_white_where_clipped(read_capture(paths[name], needs_events=False)) for name in chosen]
     captures = captures if target_size_m is None else [replace(one, target=None) for one in captures]
     for capture in captures:
         _motion(capture) if target_size_m is not None else _scene(capture)
@@ -226,6 +227,14 @@ def read_capture_set(
         raise DataError(f"{len(held)} of {len(chosen)} captures are held out; leave {least} or more to fit")
     fitted = tuple(capture for capture in captures if capture.name not in held)
     return CaptureSet(fitted, side), CaptureSet(tuple(one for one in captures if one.name in held), side)
+
+
+def _white_where_clipped(capture: Capture) -> Capture:
+    """Return a capture that is white, as saturated pixels are, where its camera is clipped below white."""
+    if (white := clipped_at(capture.frames, capture.peak)) == capture.peak:
+        return capture
+    frames = np.where(capture.frames >= white, capture.peak, capture.frames).astype(capture.frames.dtype)
+    return replace(capture, frames=frames)
 
 
 def _named(name: str, wanted: Sequence[str]) -> bool:

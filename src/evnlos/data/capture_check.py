@@ -19,6 +19,7 @@ from evnlos.data.capture import Capture
 from evnlos.data.capture_info import CaptureInfo
 from evnlos.data.clocks import FEWEST_LAGS, LEAST_AGREEMENT, beside_others, find_lag
 from evnlos.data.fixed_pattern import light_path
+from evnlos.data.frames import clipped_at
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import find_hot_pixels
@@ -90,11 +91,12 @@ def _light(capture: Capture) -> Iterator[Finding]:
         found = f"the largest of 16 bits is {int(frames.max())}: these look like {bits} bits, not scaled"
         cure = f"state camera: {{white_dn: {(1 << bits) - 1}}} in capture.yaml, beside its other keys"
         yield Finding("white level", "doubtful", found, cure)
-    clipped, log = float((frames >= peak).mean()), capture.info.camera.log
+    white, log = clipped_at(frames, peak), capture.info.camera.log
+    clipped = float((frames >= white).mean())
     if log is None and Path(capture.info.frames or "").suffix == ".bin":
         cure = "state camera: {log: {codes_per_efold: 600, white_code: 2916}}, or what your sensor has"
         yield Finding("response", "bad", "frames of a CeleX-V are logarithmic, and are read as linear", cure)
-    found = f"{100 * clipped:.2f} % of the frames' pixels are clipped"
+    found = f"{100 * clipped:.2f} % of the frames' pixels are clipped{'' if white == peak else f' at {white}'}"
     cure = "shorten the exposure, close the aperture" if log is None else "raise white_code of camera.log"
     cure += ", or dim the ambient light"
     yield _finding("saturation", clipped < 1e-3, clipped < 0.02, found, cure)

@@ -28,6 +28,7 @@ from evnlos.types import COLOURS, Colour, Events, Mosaic
 from evnlos.untrusted import check_memory, memory_left, open_image, open_regular
 
 _FURTHEST_M, _LONG_AGO_US = 10.0, 3_600_000_000
+_PLATEAU, _LEAST_CLIPPED = 5.0, 1e-4  # of pixels at the largest number: times those of the four below; of all
 _RECORDINGS = (".aedat4", ".aedat", ".bag", ".db3", ".mcap", ".bin")
 
 
@@ -261,6 +262,23 @@ def _check_times(path: Path, times: NDArray[np.int64]) -> None:
 
 
 _FLAT = 1e-6  # ratio of singular values below which points lie on a line
+
+
+def clipped_at(frames: NDArray, peak: int) -> int:
+    """Return the digital number at which frames are clipped; `peak` where nothing says that it is lower.
+
+    Where a sensor saturates below the file's white, or a video ends at 235, all brighter light is one number:
+    the largest, and far more frequent than those below it.
+
+    Args:
+        frames: Frames, unsigned integers of any shape, digital numbers.
+        peak: The file's white, the largest digital number.
+    """
+    counts = np.bincount(np.asarray(frames).ravel(), minlength=peak + 1)
+    *_, last = there = np.flatnonzero(counts)
+    usual = int(counts[there[-5:-1]].max(initial=0))
+    is_clipped = len(there) > 4 and counts[last] > max(_PLATEAU * usual, _LEAST_CLIPPED * frames.size)
+    return int(last) if is_clipped else peak
 
 
 def homography_from_points(source: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
