@@ -760,6 +760,13 @@ def test_targets_that_were_not_where_notes_place_them_are_warned_of(fit) -> None
         assert drawn[name] == pytest.approx((middle - 0.0044, middle + 0.0044))
 
 
+def test_frames_that_are_saturated_are_warned_of(fit) -> None:
+    assert fit.saturated == 0.0
+    assert "frames: 13 % of the pixels are saturated at times; expose for less" in warnings_of(
+        replace(fit, saturated=0.13)
+    )
+
+
 def test_events_of_no_known_kind_are_warned_of(fit) -> None:
     assert fit.pixel.near
     far = replace(fit, pixel=replace(fit.pixel, near=False))

@@ -122,6 +122,7 @@ class SetupFit:
         curved: What `curvature` says of the frames held out; zeros where it can only be the wall's.
         own: What each capture has of its own beside the setup and its notes; () where nothing differs.
         strays: What captures that were left out keep, over the median of all: they do not fit the others.
+        saturated: Share of the pixels that some fitted frame shows saturated; they take no part.
     """
 
     simulation: Simulation
@@ -142,6 +143,7 @@ class SetupFit:
     curved: tuple[float, float] = (0.0, 0.0)
     own: tuple[Own, ...] = ()
     strays: dict[str, float] = field(default_factory=dict)
+    saturated: float = 0.0
 
     @property
     def stray_words(self) -> list[str]:
@@ -168,6 +170,16 @@ class SetupFit:
         what = f"targets are up to {1e3 * far:.1f} mm beside their stated places ({name} most), their speeds"
         what += f" {min(speeds):+.1f} to {max(speeds):+.1f} % off"
         return [f"{what}; the fit takes that off (calibration.json says each): mend `motion` in capture.yaml"]
+
+    @property
+    def saturated_words(self) -> list[str]:
+        """Why pixels take no part in the fit, a line; none where hardly any is saturated."""
+        share = 100 * self.saturated
+        return (
+            [f"frames: {share:.0f} % of the pixels are saturated at times; expose for less"]
+            if share > 2
+            else []
+        )
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -330,6 +342,7 @@ def fit_setup(
         curved if curved[0] < 0 or about.tone or about.log else (0.0, 0.0),  # else it is the wall's
         (*fit.own, *held.own),
         strays,
+        float((fit.frames() >= fit.peak).any(axis=0).mean()),
     )
     progress(Step("calibrate", len(stages), len(stages), "stages"))
     return result

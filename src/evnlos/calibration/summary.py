@@ -133,7 +133,7 @@ def warnings_of(fit: SetupFit) -> list[str]:
     if on_bound := fit.optics.on_bound:
         names = ", ".join(f"setup.{name} ({value:.4g})" for name, value in on_bound.items())
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
-    found += curve_warning(fit.curved)
+    found += fit.saturated_words + curve_warning(fit.curved)
     if fit.unexplained is not None:
         found.append(f"{_left(fit.unexplained)}; {cure}")
     if little := _little_shown(fit):
