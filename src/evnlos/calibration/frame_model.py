@@ -256,7 +256,7 @@ def own_factors(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[NDArray
     is_seen[light] = (spread > _LEAST_CHANGE) & (spread * levels * 255 > _LEAST_CHANGE_DN)
     away = np.hypot(every[:, 2], (every[:, 3] - 1) * ways / 2)
     is_seen[2:4] = np.sqrt(np.mean(away**2)) > _LEAST_WAY_M
-    if not is_seen.any() or not (middle[:2] > 0).all() or not (every[:, 0] > 0).all():
+    if not is_seen.any() or not (middle[:2] > 0).all() or not (every[:, [0, 3]] > 0).all():
         return None
     every = np.where(is_seen, every, [1.0, middle[1], 0.0, 1.0, 0.0, 0.0])
     return np.split(every, [len(factors[0])])
