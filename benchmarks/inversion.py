@@ -186,10 +186,11 @@ def known_sensors() -> None:
         assert fit.pixel is not None and fit.maps is not None
         setup, law = replace(near, pixel=fit.pixel), fit.pixel.known_law(60.0)
         numbers = law.threshold_on, law.threshold_off, law.threshold_sigma, law.threshold_sigma
-        unknown = [np.full(SENSOR, value) for value in numbers]
+        on, off, error_on, error_off = (np.full(SENSOR, value) for value in numbers)
+        unknown = PixelMaps(on, off, error_on, error_off, fit.maps.hot)
         for name in LETTERS:
             capture, cells = sequence(replace(near, pixel=pixel), lights, name), list[str]()
-            for maps in (None, PixelMaps(*unknown, fit.maps.hot), fit.maps):
+            for maps in (None, unknown, fit.maps):
                 found = estimate_target(capture, setup, "events", lights=lights, maps=maps)
                 truth = HandwritingGlyphs().target(f"writer03_{name}").rasterise(found.plane)
                 psnr = -10 * float(np.log10(np.square(found.image - truth).mean()))

@@ -273,11 +273,10 @@ def test_a_sensor_that_was_measured_tells_more() -> None:
         pixel = replace(PIXEL, pattern_seed=seed + 20)
         law, events = pixel.crossing_law(40.0), simulated(seed, pixel)
         assert law is not None
-        true = [one.reshape(shape) for one in pixel_thresholds(pixel, shape, 0, None)]
-        draw = np.random.default_rng(seed)
-        means = [one + draw.normal(0, 0.002, shape) for one in true]
-        errors = [np.full(shape, 0.002), np.full(shape, 0.002)]
-        known = replace(law, known=PixelMaps(*means, *errors, np.zeros(shape, np.bool_)))
+        draw, err = np.random.default_rng(seed), np.full(shape, 0.002)
+        true = pixel_thresholds(pixel, shape, 0, None)
+        on, off = (one.reshape(shape) + draw.normal(0, 0.002, shape) for one in true)
+        known = replace(law, known=PixelMaps(on, off, err, err, np.zeros(shape, np.bool_)))
         for k, each in enumerate((law, known)):
             record = record_of(events, each, (0.0, BENCH.duration_s), 0.4)
             found = estimate_sequence(
@@ -294,9 +293,8 @@ def test_what_is_known_of_thresholds_and_hot_pixels() -> None:
     """Maps of nothing known change nothing; hot pixels are gone; no threshold is surer than the rest allows."""
     law, shape, events = PIXEL.crossing_law(40.0), light().shape, simulated(0)
     assert law is not None
-    values = (law.threshold_on, law.threshold_off, law.threshold_sigma, law.threshold_sigma)
-    hot = np.zeros(shape, np.bool_)
-    maps = PixelMaps(*(np.full(shape, one) for one in values), hot)
+    on, off, err = (np.full(shape, one) for one in (law.threshold_on, law.threshold_off, law.threshold_sigma))
+    maps = PixelMaps(on, off, err, err, np.zeros(shape, np.bool_))
     settings, span = LikelihoodSettings(least_noise=EXACT), (0.0, BENCH.duration_s)
     alike = replace(law, known=maps)
     found = estimate_sequence(light(), prior(), alike, record_of(events, alike, span, 0.4), settings=settings)

@@ -121,8 +121,8 @@ def known_of_each_pixel(out: Path) -> None:
     drawn = pixel_thresholds(sensor, shape, 0, maps)
     normal = (pixel_thresholds(sensor, shape, 0, None)[0] - 0.2) / 0.02
     assert drawn[0] == pytest.approx(maps.on.ravel() + maps.error_on.ravel() * normal)
-    every = [np.full(shape, value) for value in (0.2, 0.26, 0.02, 0.02)]
-    unknown = PixelMaps(*every, np.zeros(shape, np.bool_))
+    on, off, error = (np.full(shape, value) for value in (0.2, 0.26, 0.02))
+    unknown = PixelMaps(on, off, error, error, np.zeros(shape, np.bool_))
     frames, times = np.linspace(20, 200, 8)[:, None, None] * np.ones((8, *shape)), np.arange(8) / 50
     plain = simulate_events(frames, times, sensor, seed=3)
     assert simulate_events(frames, times, sensor, seed=3, thresholds=unknown) == plain

@@ -256,7 +256,7 @@ def maps_of(
         seen.append(_ratios([(one, one.events) for one in lit]))
     made = np.concatenate(seen, axis=0)
     measured = np.concatenate([np.ones((len(made), 1)), made], axis=1) @ weights
-    maps, told = list[Array](), list[float]()
+    maps, told = list[NDArray[np.float64]](), list[float]()
     means = math.log(law.threshold_on), math.log(law.threshold_off)
     for column, error, mean in zip(measured.T, left, means, strict=True):
         between = max(float(column.var()) - error**2, 0.0)

@@ -102,8 +102,8 @@ class PixelMaps:
 
     def mapped(self, work: Callable[[NDArray], NDArray]) -> PixelMaps:
         """Return maps with the same done to each, such as a cut."""
-        fields = (self.on, self.off, self.error_on, self.error_off, self.hot)
-        return PixelMaps(*(work(one) for one in fields), self.told)
+        errors = work(self.error_on), work(self.error_off)
+        return PixelMaps(work(self.on), work(self.off), *errors, work(self.hot), self.told)
 
 
 @dataclass(frozen=True)

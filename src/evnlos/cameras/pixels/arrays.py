@@ -128,7 +128,8 @@ def load_pixel_maps(word: str | Path) -> PixelMaps | None:
             raise ValueError("its maps are not of one size, or negative")
     except (ConfigError, *NUMPY_ERRORS) as error:
         raise DataError(f"{path} holds no thresholds of a sensor: {' '.join(str(error).split())}") from None
-    return PixelMaps(*numbers, hot)
+    on, off, error_on, error_off = numbers
+    return PixelMaps(on, off, error_on, error_off, hot)
 
 
 def pattern_key(pixel: ContrastSettings, seed: int) -> np.uint64:
