@@ -3,6 +3,7 @@ And what does the likelihood of a whole sequence cost?
 
     python benchmarks/inversion.py
     python benchmarks/inversion.py --likelihood --write benchmarks/results/likelihood.md
+    python benchmarks/inversion.py --maps
 
 A character on the setup "main" (rough aluminium of roughness 0.05, 0.3 m), 30 x 48 pixels in both cameras. The
 unknown is the scene's change between two instants 0.8 s apart, 16 mm of travel (paper Eq. event_fm1 and
@@ -16,6 +17,12 @@ and G.
 frames, a letter of an unseen hand) as `evnlos invert --from events` and `--from both` do, with thresholds that
 make once, twice and four times as many events. Processor time of one thread, the light path aside, and the
 memory that the process held at most while it solved, over what it held before; each in a process of its own.
+
+`--maps` asks what it is worth to know the sensor, of the same sequences: letters of two sensors, whose pixels
+differ by 10 and 20 % of a threshold, 3 of 1000 of them hot. Each is fitted as `evnlos pixel fit` does, to 5 s
+of a sine of 2 Hz and 10 s of constant light. The letters are solved with the fitted pixel: without its maps,
+without the events of its hot pixels, and with its thresholds, too. PSNR over the target plane (expected), and
+how many cells are in the 90 % interval.
 """
 
 import argparse
@@ -25,14 +32,17 @@ import time
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 import torch
 
-from evnlos.cameras import EventCamera, EventPixel, FrameCamera, simulate_events
+from evnlos.calibration import KnownLight, LitFile, Manifest, PixelFitSettings, fit_known_light, waveform
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelMaps, simulate_events
 from evnlos.config import from_dict
 from evnlos.data import Capture, CaptureInfo
+from evnlos.events import write_events
 from evnlos.inverse import Gradient, LogChange, SequenceLights, log_change, tikhonov
 from evnlos.inverse.event_images import event_prior
 from evnlos.machine import one_thread
@@ -41,6 +51,9 @@ from evnlos.optics import MatrixTransport
 from evnlos.scene import HandwritingGlyphs, Scene
 from evnlos.setups import RadiometricSetup, Setup, load_setup
 from machine import machine
+
+LETTERS, SENSORS = "HSE", ((0.02, 11), (0.04, 12))  # mismatch in log units, and pattern_seed
+LIGHTS = (KnownLight("sine", 60.0, 2.0, 0.7), 5.0), (KnownLight("static", 60.0), 10.0)
 
 SHAPE = (30, 48)
 TIMES_S = (3.6, 4.4)
@@ -80,8 +93,8 @@ def compare(gain: float, ambient: float, character: str, seed: int = 0) -> dict[
     return row | {"events per pixel": len(events) / (SHAPE[0] * SHAPE[1])}
 
 
-def sequence(threshold: float, lights: SequenceLights) -> Capture:
-    """Return a capture of a letter whose pixels have such thresholds, log units."""
+def sequence(setup: Setup, lights: SequenceLights, name: str = "R") -> Capture:
+    """Return a capture of a letter behind a setup."""
     info = from_dict(
         CaptureInfo,
         {
@@ -93,11 +106,10 @@ def sequence(threshold: float, lights: SequenceLights) -> Capture:
     times_us = np.arange(FRAMES + 1) * int(1e6 * SECONDS / FRAMES)
     blank = np.zeros((len(times_us), *SENSOR), np.uint8)
     empty = Capture("letter", info, simulate_events(blank[:2], [0.0, SECONDS]), blank, times_us, None)
-    setup = pixels(threshold)
     basis, motion = event_prior(setup, info.target_size_m, 120), empty.motion
     assert motion is not None
     light = lights.of(setup.seen_by(SENSOR), basis, motion.in_its_plane(), (0.0, SECONDS), SENSOR)
-    letter = HandwritingGlyphs().target("writer03_R").rasterise(basis.target_plane)
+    letter = HandwritingGlyphs().target(f"writer03_{name}").rasterise(basis.target_plane)
     seen = np.maximum(light(basis.coefficients(letter.astype(np.float64))), 1e-3)
     video = np.ascontiguousarray(255 * seen.T.reshape(-1, *SENSOR), np.float32)
     events = simulate_events(video, light.times_s, setup.pixel, seed=1)
@@ -123,7 +135,8 @@ def cost(evidence: Evidence, threshold: float) -> tuple[int, float, float, float
     """Return events, seconds, MiB beside what was held before, and PSNR over the target plane, dB."""
     one_thread()
     lights = SequenceLights()
-    capture, setup = sequence(threshold, lights), pixels(threshold)
+    setup = pixels(threshold)
+    capture = sequence(setup, lights)
     before = held_mib("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the most that was held counts from now
     begun = time.process_time()
@@ -150,6 +163,43 @@ def costs() -> str:
     return "\n".join(lines) + "\n"
 
 
+def known_sensors() -> None:
+    """Print the table of what it is worth to know the sensor."""
+    near, lights = load_setup(NEAR), SequenceLights()
+    print("| mismatch | letter | pixel alone | without hot pixels | thresholds, too |\n|" + "---|" * 5)
+    for sigma, seed in SENSORS:
+        own = {
+            "shot_noise_rate_hz": 0.02,
+            "initial_phase": "random",
+            "pattern_seed": seed,
+            "threshold_sigma": sigma,
+        }
+        pixel = replace(near.pixel, **own, hot_pixel_fraction=0.003, hot_pixel_rate_hz=20.0)
+        with TemporaryDirectory() as folder:
+            listed = []
+            for k, (light, seconds) in enumerate(LIGHTS):
+                times, level = waveform(light, seconds)
+                video = np.tile(level.astype(np.float32)[:, None, None], (1, *SENSOR))
+                write_events(Path(folder) / f"{k}.npz", simulate_events(video, times, pixel, seed=100 + k))
+                listed.append(LitFile(str(Path(folder) / f"{k}.npz"), light))
+            fit = fit_known_light(Manifest(tuple(listed)), PixelFitSettings(("continuous",)))
+        assert fit.pixel is not None and fit.maps is not None
+        setup, law = replace(near, pixel=fit.pixel), fit.pixel.known_law(60.0)
+        numbers = law.threshold_on, law.threshold_off, law.threshold_sigma, law.threshold_sigma
+        on, off, error_on, error_off = (np.full(SENSOR, value) for value in numbers)
+        unknown = PixelMaps(on, off, error_on, error_off, fit.maps.hot)
+        for name in LETTERS:
+            capture, cells = sequence(replace(near, pixel=pixel), lights, name), list[str]()
+            for maps in (None, unknown, fit.maps):
+                found = estimate_target(capture, setup, "events", lights=lights, maps=maps)
+                truth = HandwritingGlyphs().target(f"writer03_{name}").rasterise(found.plane)
+                psnr = -10 * float(np.log10(np.square(found.image - truth).mean()))
+                covered = float(((truth >= found.low) & (truth <= found.high)).mean())
+                bound = -10 * float(np.log10(found.expected_error))
+                cells.append(f"{psnr:.2f} dB ({bound:.2f}), {100 * covered:.0f} %")
+            print(f"| {sigma} | {name} | {' | '.join(cells)} |", flush=True)
+
+
 def channels() -> None:
     """Print the table of frames beside events."""
     names = None
@@ -165,9 +215,12 @@ def channels() -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--likelihood", action="store_true", help="what the likelihood of a sequence costs")
+    parser.add_argument("--maps", action="store_true", help="what it is worth to know the sensor")
     parser.add_argument("--write", type=Path, help="file for that table")
     asked = parser.parse_args()
-    if asked.likelihood:
+    if asked.maps:
+        known_sensors()
+    elif asked.likelihood:
         page = costs()
         if asked.write:
             asked.write.write_text(page)

@@ -221,7 +221,9 @@ def test_sums_over_the_nodes_are_those_of_whole_rows(spread: float) -> None:
     pixel, group = (column[np.lexsort((group, pixel))] for column in (pixel, group))
     node, slope = rng.integers(0, nodes - 1, (count, 2)), draw(count, 4, seed=1)
     weight, residual = rng.uniform(0.5, 2, count), draw(count, seed=2)
-    found = film_equations(FilmRows(pixel, node, slope, weight, residual, group), light, spread)
+    found = film_equations(
+        FilmRows(pixel, node, slope, weight, residual, group), light, np.full(2 * pixels, spread)
+    )
     tau = np.zeros((count, nodes))
     for k, at in enumerate((node[:, 0], node[:, 0] + 1, node[:, 1], node[:, 1] + 1)):
         np.add.at(tau, (np.arange(count), at), slope[:, k])

@@ -17,7 +17,8 @@ from evnlos.cli import main
 from evnlos.config import from_dict, save_yaml, to_dict
 from evnlos.data import CaptureInfo
 from evnlos.data.capture_check import check_capture
-from evnlos.data.fixed_pattern import own_pixels, used_pixels
+from evnlos.data.fixed_pattern import used_pixels
+from evnlos.data.frames import own_pixels
 from evnlos.data.lab import Lab, render_captures
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs

@@ -12,7 +12,8 @@ import torch
 
 from evnlos.analysis import SequenceAnalysisSettings, check_sampling, event_information
 from evnlos.calibration import write_event_errors
-from evnlos.cameras import CircuitPixel, EventPixel, FrameCamera, PixelSettings, simulate_events
+from evnlos.cameras import CircuitPixel, EventPixel, FrameCamera, PixelMaps, PixelSettings, simulate_events
+from evnlos.cameras.pixels.arrays import pixel_thresholds
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, Simulation, capture_samples, read_capture, simulate
@@ -263,6 +264,51 @@ def test_the_result_does_not_depend_on_blocks() -> None:
     settings = LikelihoodSettings(block=37, least_noise=EXACT)
     found = estimate_sequence(light(), prior(), PIXEL.crossing_law(40.0), recorded(0), settings=settings)
     np.testing.assert_allclose(found.z, estimated(0).z, atol=1e-5)
+
+
+def test_a_sensor_that_was_measured_tells_more() -> None:
+    """Thresholds that are known to a tenth of the mismatch bring what is estimated nearer to the truth."""
+    shape, squares, hits = light().shape, np.zeros(2), list[float]()
+    for seed in range(3):
+        pixel = replace(PIXEL, pattern_seed=seed + 20)
+        law, events = pixel.crossing_law(40.0), simulated(seed, pixel)
+        assert law is not None
+        draw, err = np.random.default_rng(seed), np.full(shape, 0.002)
+        true = pixel_thresholds(pixel, shape, 0, None)
+        on, off = (one.reshape(shape) + draw.normal(0, 0.002, shape) for one in true)
+        known = replace(law, known=PixelMaps(on, off, err, err, np.zeros(shape, np.bool_)))
+        for k, each in enumerate((law, known)):
+            record = record_of(events, each, (0.0, BENCH.duration_s), 0.4)
+            found = estimate_sequence(
+                light(), prior(), each, record, settings=LikelihoodSettings(least_noise=EXACT)
+            )
+            squares[k] += error(found, seed)
+        away = np.abs(found.image - prior().image(truth(seed)))
+        hits.append(float((away <= 1.645 * found.deviation).mean()))
+    assert squares[1] < 0.5 * squares[0]
+    assert np.mean(hits) > 0.85
+
+
+def test_what_is_known_of_thresholds_and_hot_pixels() -> None:
+    """Maps of nothing known change nothing; hot pixels are gone; no threshold is surer than the rest allows."""
+    law, shape, events = PIXEL.crossing_law(40.0), light().shape, simulated(0)
+    assert law is not None
+    on, off, err = (np.full(shape, one) for one in (law.threshold_on, law.threshold_off, law.threshold_sigma))
+    maps = PixelMaps(on, off, err, err, np.zeros(shape, np.bool_))
+    settings, span = LikelihoodSettings(least_noise=EXACT), (0.0, BENCH.duration_s)
+    alike = replace(law, known=maps)
+    found = estimate_sequence(light(), prior(), alike, record_of(events, alike, span, 0.4), settings=settings)
+    np.testing.assert_allclose(found.z, estimated(0).z, atol=1e-9)
+    hot = np.random.default_rng(3).random(shape) < 0.2
+    without = record_of(events, replace(law, known=replace(maps, hot=hot)), span, 0.4)
+    whole = recorded(0)
+    expected = whole.of_pixels(~hot.ravel()[whole.pixel])
+    for name in ("pixel", "t_s", "sign", "origin"):
+        np.testing.assert_array_equal(getattr(without, name), getattr(expected, name))
+    sure = replace(law, known=replace(maps, error_on=np.full(shape, 0.005), error_off=np.full(shape, 0.05)))
+    mean, deviation = sure.doubted(0.012).thresholds(hot.size)
+    assert mean.reshape(-1, 2) == pytest.approx(np.tile([law.threshold_off, law.threshold_on], (hot.size, 1)))
+    assert deviation.reshape(-1, 2) == pytest.approx(np.tile([0.05, 0.013], (hot.size, 1)))
 
 
 def test_what_is_refused() -> None:

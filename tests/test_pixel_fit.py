@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
@@ -29,12 +30,23 @@ from evnlos.calibration import (
     value_of,
     waveform,
 )
-from evnlos.cameras import BrownianPixel, EventPixel, PixelSettings, load_pixel, simulate_events
+from evnlos.cameras import (
+    BrownianPixel,
+    EventPixel,
+    PixelMaps,
+    PixelSettings,
+    load_pixel,
+    load_pixel_maps,
+    simulate_events,
+)
+from evnlos.cameras.pixels.arrays import pixel_thresholds
 from evnlos.cli import main
 from evnlos.cli.main import command_of
-from evnlos.config import load_yaml, save_yaml
+from evnlos.config import load_yaml, save_yaml, to_dict
+from evnlos.data import Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import read_events, write_events
+from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.types import Events
 
 QUICK = PixelFitSettings(("continuous",), pixels=80, ensemble=16, simulations=36, checks=12)
@@ -94,6 +106,103 @@ def folder(tmp_path_factory):
     return path
 
 
+def known_of_each_pixel(out: Path) -> None:
+    """The thresholds are those of the sensor, with the errors that are stated: nobody has to shrink them."""
+    sensor = EventPixel(0.2, 0.26, 0.02, 80.0, 0.15, 0.8, 1e-3, pattern_seed=4)
+    maps, shape = load_pixel_maps(out / "pixel.yaml"), (24, 24)
+    assert maps is not None and not maps.hot.any()
+    both = zip((maps.on, maps.off), (maps.error_on, maps.error_off), strict=True)
+    for (mean, error), true in zip(both, pixel_thresholds(sensor, shape, 0, None), strict=True):
+        away = mean.ravel() - true
+        assert away.std() == pytest.approx(np.sqrt(np.square(error).mean()), rel=0.25)
+        assert away.std() < 0.6 * true.std()
+        assert np.polyfit(mean.ravel(), true, 1)[0] == pytest.approx(1.0, abs=0.12)
+    # of what is not known a draw, which is the drawn sensor where nothing is known
+    drawn = pixel_thresholds(sensor, shape, 0, maps)
+    normal = (pixel_thresholds(sensor, shape, 0, None)[0] - 0.2) / 0.02
+    assert drawn[0] == pytest.approx(maps.on.ravel() + maps.error_on.ravel() * normal)
+    on, off, error = (np.full(shape, value) for value in (0.2, 0.26, 0.02))
+    unknown = PixelMaps(on, off, error, error, np.zeros(shape, np.bool_))
+    frames, times = np.linspace(20, 200, 8)[:, None, None] * np.ones((8, *shape)), np.arange(8) / 50
+    plain = simulate_events(frames, times, sensor, seed=3)
+    assert simulate_events(frames, times, sensor, seed=3, thresholds=unknown) == plain
+    with pytest.raises(ConfigError, match="the sensor is 6 x 6"):
+        simulate_events(frames[:, :6, :6], times, sensor, thresholds=maps)
+
+
+def seen_by_the_same_sensor(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`evnlos events` takes the thresholds for a video of the sensor's size, unless flags say others."""
+    np.save(tmp_path / "seen.npy", np.linspace(20, 200, 8)[:, None, None] * np.ones((8, 24, 24)))
+    words = ["events", str(tmp_path / "seen.npy"), "--fps", "50", "--json", "--force"]
+    words += ["--pixel", str(out / "pixel.yaml"), "--out", str(tmp_path / "seen.npz")]
+    for more, known, note in (
+        ([], True, ""),
+        (["--pixel.pattern-seed", "3"], False, ""),
+        (["--scale", "12x12"], False, "thresholds are drawn"),
+    ):
+        capsys.readouterr()
+        main([*words, *more])
+        shown = capsys.readouterr()
+        assert json.loads(shown.out)["measured_thresholds"] is known and note in shown.err
+
+
+def test_a_sensor_that_was_measured_is_known_to_the_inversion(
+    tiny_captures: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape, fitted = (48, 72), tmp_path / "fit"
+    fitted.mkdir()
+    pixel = EventPixel(0.21, 0.24, 0.04, 40.0, 0.05, 0.08)
+    save_yaml(pixel, fitted / "pixel.yaml")
+    setup = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(*shape))
+    save_yaml(to_dict(Simulation(setup=setup)), tmp_path / "setup.yaml")
+
+    def measured(
+        on: float, error: float, hot: int, size: tuple[int, int] = shape, folder: Path = fitted
+    ) -> None:
+        names = "threshold_on", "threshold_off", "error_on", "error_off"
+        maps = {name: np.full(size, value) for name, value in zip(names, (on, 0.24, error, error), strict=True)}
+        flags = np.zeros(size, np.bool_)
+        flags.ravel()[:hot] = True
+        np.savez(folder / "pixel_maps.npz", **maps, hot=flags)
+
+    def inverted(*words: str) -> np.ndarray:
+        given = [str(tiny_captures[0]), "--setup", str(tmp_path / "setup.yaml"), "--from", "events"]
+        out = ["--out", str(tmp_path / "found.png"), "--force", "--json"]
+        main(["invert", *given, *out, *words])
+        capsys.readouterr()
+        return np.load(tmp_path / "found.npz")[tiny_captures[0].name]
+
+    known = "--pixel", str(fitted / "pixel.yaml")
+    plain = inverted(*known)
+    assert np.abs(plain - inverted()).max() > 0.01  # the setup's own pixel is another
+    measured(0.21, 0.04, 0)
+    assert inverted(*known) == pytest.approx(plain, abs=1e-6)  # nothing is known of any pixel
+    measured(0.3, 0.04, 0)
+    other = inverted(*known)
+    assert np.abs(other - plain).max() > 0.01
+    measured(0.21, 0.04, 800)
+    assert np.abs(inverted(*known) - plain).max() > 0.001
+    own = inverted()
+    measured(0.3, 0.04, 0, folder=tmp_path)  # as in the folder of a calibrated setup
+    assert np.abs(inverted() - own).max() > 0.01
+    for size, word in (((24, 72), "48"), ((72, 48), "48")):
+        measured(0.21, 0.04, 0, size)
+        with pytest.raises(SystemExit):
+            inverted(*known)
+        told = capsys.readouterr().err
+        assert f"are of {size[1]} x {size[0]} pixels, the event camera has 72 x {word}" in told
+    with pytest.raises(SystemExit):
+        inverted(*known, "--from", "frames")
+    assert "--from events or both" in capsys.readouterr().err
+    (fitted / "pixel_maps.npz").write_bytes(b"no archive")
+    with pytest.raises(DataError, match="holds no thresholds of a sensor"):
+        load_pixel_maps(fitted)
+    np.savez(fitted / "pixel_maps.npz", hot=np.zeros(shape))
+    with pytest.raises(DataError, match="holds no thresholds of a sensor"):
+        load_pixel_maps(fitted)
+    assert load_pixel_maps("davis346") is None and load_pixel_maps(tmp_path / "none") is None
+
+
 def test_the_command_writes_a_pixel_that_other_commands_take(folder, tmp_path, capsys) -> None:
     out = tmp_path / "fit"
     words = [
@@ -119,6 +228,8 @@ def test_the_command_writes_a_pixel_that_other_commands_take(folder, tmp_path, c
     maps = np.load(out / "pixel_maps.npz")
     assert maps["threshold_on"].shape == (24, 24) and (maps["error_on"] > 0).all()
     assert set(values["maps"]["state"]) <= {"identified", "not identified"}
+    known_of_each_pixel(out)
+    seen_by_the_same_sensor(out, tmp_path, capsys)
     pixel = load_yaml(PixelSettings, out / "pixel.yaml")
     assert pixel == load_pixel(str(out / "pixel.yaml"))
     assert (

@@ -19,8 +19,8 @@ from evnlos.calibration.event_statistics import count_map, simulated
 from evnlos.calibration.pixel_fit import CandidateFit, Panels, PixelFitSettings
 from evnlos.calibration.pixel_light import KnownLight, LitEvents, LitRecording, lit_recording
 from evnlos.calibration.pixel_statistics import Array
-from evnlos.cameras import PixelSettings
-from evnlos.cameras.event_model import require
+from evnlos.cameras import PixelMaps, PixelSettings
+from evnlos.cameras.event_model import MIN_THRESHOLD, require
 from evnlos.cameras.pixels.arrays import pixel_thresholds
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.cameras.video import open_video
@@ -202,27 +202,7 @@ def doubts_of(one: LitEvents) -> list[str]:
 
 
 _TOLD = 0.3  # share of a map's variance that events must explain
-
-
-@dataclass(frozen=True, eq=False)
-class PixelMaps:
-    """Thresholds of each pixel, log units, [H, W].
-
-    Args:
-        on: Threshold of ON events.
-        off: Threshold of OFF events.
-        error_on: Standard error of `on`; that of the mismatch where a pixel's events do not tell.
-        error_off: The same for `off`.
-        told: Share of the mismatch's variance that events explain, (ON, OFF); 0 = not identified.
-        hot: Pixels that fire without cause, bool [H, W].
-    """
-
-    on: Array
-    off: Array
-    error_on: Array
-    error_off: Array
-    told: tuple[float, float]
-    hot: NDArray[np.bool_]
+_TAUGHT = 0.15  # least mismatch of the pixels that teach, of the threshold: their regression then pulls nothing
 
 
 def maps_of(
@@ -234,8 +214,11 @@ def maps_of(
 ) -> PixelMaps | None:
     """Return each pixel's thresholds, by a regression that simulated pixels of known thresholds teach.
 
-    What is regressed on is the log of the way that the log light goes up and down, over the events of either
-    sign, of each recording whose light moves. The regression's own residual is the error.
+    The pixels that teach differ widely, so that the regression measures a threshold, and its residual is the
+    error e. How much the sensor's own differ, v, is the variance of what was measured less e^2: all its pixels
+    tell that better than the fit does. The map is the mean of the posterior, m + v / (v + e^2) (measured - m),
+    of variance v e^2 / (v + e^2): nobody has to shrink it. What is regressed on is the log of the way that the
+    log light goes up and down, over the events of either sign, of each recording whose light moves.
 
     Args:
         fit: The model.
@@ -250,20 +233,20 @@ def maps_of(
     pixel, pixels = fit.pixel, panels.recordings[0].light.shape[2]
     few = [panels.recordings[k] for k in moving]
     known, looked = [], []
+    law = pixel.known_law(WHITE_DN)
+    wide = max(law.threshold_sigma, _TAUGHT * 0.5 * (law.threshold_on + law.threshold_off))
+    settled: dict[str, Any] = {"threshold_sigma": wide, "initial_phase": "random"}
     for n in range(4):
         seed = derive_seed(settings.seed, "maps", n)
-        sensor: PixelSettings = replace(pixel, pattern_seed=seed, initial_phase="random")  # type: ignore[type-var]
+        sensor: PixelSettings = replace(pixel, pattern_seed=seed, **settled)  # type: ignore[type-var]
         events = simulated(few, sensor, seed)
         known.append(np.log(np.stack(pixel_thresholds(sensor, (1, pixels), seed, None))))  # type: ignore[arg-type]
         looked.append(_ratios([(one, found) for one, found in zip(few, events, strict=True)]))
     truth, given = np.concatenate(known, axis=1).T, np.concatenate(looked, axis=0)
     design = np.concatenate([np.ones((len(given), 1)), given], axis=1)
-    pull = np.diag([0.0, *np.full(given.shape[1], 1e-3 * len(given))])
+    pull = np.diag([0.0, *np.full(given.shape[1], 1e-5 * len(given))])
     weights = np.linalg.solve(design.T @ design + pull, design.T @ truth)
-    left = (truth - design @ weights).std(axis=0)
-    told = tuple(
-        float(max(0.0, 1 - (r / max(s, 1e-9)) ** 2)) for r, s in zip(left, truth.std(axis=0), strict=True)
-    )
+    left = (truth - design @ weights).std(axis=0).tolist()
     shape = sources[0].events.shape
     inside = np.logical_and.reduce([sources[k].inside for k in moving]) & ~hot
     place = np.flatnonzero(inside)
@@ -272,20 +255,21 @@ def maps_of(
         lit = [lit_recording(sources[k], block, settings.most_s) for k in moving]
         seen.append(_ratios([(one, one.events) for one in lit]))
     made = np.concatenate(seen, axis=0)
-    values = np.exp(np.concatenate([np.ones((len(made), 1)), made], axis=1) @ weights)
-    means = truth.mean(axis=0)
-    out = []
-    for k in range(2):
-        value, error = (
-            np.full(shape, math.exp(means[k])),
-            np.full(shape, math.exp(means[k]) * truth[:, k].std()),
-        )
-        if told[k] >= _TOLD:
-            value.ravel()[place] = np.maximum(values[:, k], 0.01)
-            error.ravel()[place] = values[:, k] * left[k]
-        out.append((value, error))
-    shown = tuple(one if one >= _TOLD else 0.0 for one in told)
-    return PixelMaps(out[0][0], out[1][0], out[0][1], out[1][1], shown, hot)  # type: ignore[arg-type]
+    measured = np.concatenate([np.ones((len(made), 1)), made], axis=1) @ weights
+    maps, told = list[NDArray[np.float64]](), list[float]()
+    means = math.log(law.threshold_on), math.log(law.threshold_off)
+    for column, error, mean in zip(measured.T, left, means, strict=True):
+        between = max(float(column.var()) - error**2, 0.0)
+        share = between / (between + error**2)
+        told.append(share if share >= _TOLD else 0.0)
+        value, deviation = np.full(shape, math.exp(mean)), np.full(shape, law.threshold_sigma)
+        if told[-1]:
+            middle = float(column.mean())
+            value[:], deviation[:] = math.exp(middle), math.exp(middle) * math.sqrt(between)
+            own = np.maximum(np.exp(middle + share * (column - middle)), MIN_THRESHOLD)
+            value.ravel()[place], deviation.ravel()[place] = own, own * error * math.sqrt(share)
+        maps += [value, deviation]
+    return PixelMaps(maps[0], maps[2], maps[1], maps[3], hot, (told[0], told[1]))
 
 
 def _ratios(pairs: Sequence[tuple[LitRecording, Events]]) -> Array:

@@ -24,7 +24,7 @@ from evnlos.calibration.pixel_checks import (
     refractory_of,
     tick_of,
 )
-from evnlos.calibration.pixel_files import Manifest, PixelMaps, doubts_of, maps_of, read_lit_events
+from evnlos.calibration.pixel_files import Manifest, doubts_of, maps_of, read_lit_events
 from evnlos.calibration.pixel_fit import (
     CandidateFit,
     Estimate,
@@ -33,19 +33,14 @@ from evnlos.calibration.pixel_fit import (
     panels_of,
 )
 from evnlos.calibration.pixel_light import LitEvents, LitRecording, choose_panel, lit_recording
-from evnlos.cameras import PixelSettings, ReadoutPixel
+from evnlos.cameras import PIXEL_MAPS_FILE, PixelMaps, PixelSettings, ReadoutPixel
 from evnlos.config import save_yaml, to_dict
 from evnlos.errors import DataError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, Step, silent
 from evnlos.registry import __version__
 
-PIXEL_FILE, PIXEL_VALUES_FILE, PIXEL_FIGURE, PIXEL_MAPS_FILE = (
-    "pixel.yaml",
-    "pixel_fit.json",
-    "pixel_fit.png",
-    "pixel_maps.npz",
-)
+PIXEL_FILE, PIXEL_VALUES_FILE, PIXEL_FIGURE = "pixel.yaml", "pixel_fit.json", "pixel_fit.png"
 UNITS = {
     "threshold_on": "log units",
     "threshold_off": "log units",

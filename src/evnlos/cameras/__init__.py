@@ -1,7 +1,7 @@
 """What a camera makes of the light on the wall: frames and events."""
 
 from evnlos.cameras.event_camera import EventCamera, EventStream, simulate_events
-from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, PixelSettings
+from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, PixelMaps, PixelSettings
 from evnlos.cameras.frame_camera import (
     FrameCamera,
     FrameCameraSettings,
@@ -11,6 +11,7 @@ from evnlos.cameras.frame_camera import (
     of_mosaic,
 )
 from evnlos.cameras.pixel import EventPixel, LogCodes, V2ePixel
+from evnlos.cameras.pixels.arrays import PIXEL_MAPS_FILE, load_pixel_maps
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.circuit import CircuitPixel
 from evnlos.cameras.pixels.readout import FlickeringWall, ReadoutPixel
@@ -18,6 +19,7 @@ from evnlos.cameras.sensors import CelexCamera, CelexPixel, load_pixel, pixel_pr
 
 __all__ = [
     "EVENT_MODELS",
+    "PIXEL_MAPS_FILE",
     "BrownianPixel",
     "CelexCamera",
     "CelexPixel",
@@ -32,11 +34,13 @@ __all__ = [
     "FrameCameraSettings",
     "LogCodes",
     "LogFrameCamera",
+    "PixelMaps",
     "PixelSettings",
     "ReadoutPixel",
     "V2ePixel",
     "colour_filters",
     "load_pixel",
+    "load_pixel_maps",
     "mosaicked",
     "of_mosaic",
     "pixel_preset",

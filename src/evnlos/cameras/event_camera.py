@@ -16,7 +16,7 @@ import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_model import PixelSettings
+from evnlos.cameras.event_model import PixelMaps, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Mode, in_mode
 from evnlos.cameras.pixels.continuous_math import log_light
 from evnlos.cameras.random_numbers import check_seed
@@ -59,7 +59,7 @@ class EventStream:
         mode: "v2e" steps an `EventPixel` from frame to frame as v2e does; "exact" runs the model that the
             settings name.
         seed: Seed of mismatch and noise, 0 to 2**64 - 1.
-        thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units; None draws them.
+        thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units, or measured; None draws them.
         threads: Number of threads; None = as many as torch uses.
         tile_px: Pixels that run through a block together; None = a size that fits the cache.
 
@@ -82,7 +82,7 @@ class EventStream:
         *,
         mode: Mode = "exact",
         seed: int = 0,
-        thresholds: tuple[ArrayLike, ArrayLike] | None = None,
+        thresholds: tuple[ArrayLike, ArrayLike] | PixelMaps | None = None,
         threads: int | None = None,
         tile_px: int | None = None,
     ) -> None:
@@ -148,7 +148,7 @@ def simulate_events(
     pixel: PixelSettings | None = None,
     mode: Mode = "exact",
     seed: int = 0,
-    thresholds: tuple[ArrayLike, ArrayLike] | None = None,
+    thresholds: tuple[ArrayLike, ArrayLike] | PixelMaps | None = None,
     *,
     threads: int | None = None,
     tile_px: int | None = None,
@@ -168,7 +168,7 @@ def simulate_events(
         mode: "exact" solves for the instants in continuous time. "v2e" steps from frame to frame and gives the
             same multiset of events as v2e at commit cac6384 wherever no random number is involved.
         seed: Seed of mismatch and noise, 0 to 2**64 - 1: same seed, same bytes, for any threads and tiles.
-        thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units; None draws them.
+        thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units, or measured; None draws them.
         threads: Number of threads; None = as many as torch uses.
         tile_px: Pixels that run together; None = a size that fits the cache.
 

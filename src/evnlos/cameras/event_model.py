@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -76,6 +77,35 @@ class LogCurve(NamedTuple):
     """What is added, DN."""
 
 
+@dataclass(frozen=True, eq=False)
+class PixelMaps:
+    """What is known of the thresholds of each pixel of a sensor, log units, [H, W].
+
+    A threshold is normal about its mean, which is that of a posterior: the less a pixel's events tell, the
+    nearer it is to the mean of all pixels, and the nearer its error to the mismatch.
+
+    Args:
+        on: Mean of the ON threshold.
+        off: Mean of the OFF threshold.
+        error_on: Standard deviation of what the ON threshold differs by.
+        error_off: The same for OFF.
+        hot: Pixels that fire without cause, bool [H, W]; their events tell nothing.
+        told: Share of the mismatch's variance that events explain, (ON, OFF); 0 = not identified.
+    """
+
+    on: NDArray[np.float64]
+    off: NDArray[np.float64]
+    error_on: NDArray[np.float64]
+    error_off: NDArray[np.float64]
+    hot: NDArray[np.bool_]
+    told: tuple[float, float] = (1.0, 1.0)
+
+    def mapped(self, work: Callable[[NDArray], NDArray]) -> PixelMaps:
+        """Return maps with the same done to each, such as a cut."""
+        errors = work(self.error_on), work(self.error_off)
+        return PixelMaps(work(self.on), work(self.off), *errors, work(self.hot), self.told)
+
+
 @dataclass(frozen=True)
 class CrossingLaw:
     """What an event of a threshold pixel says of the light, in numbers: the constants of a likelihood.
@@ -103,6 +133,7 @@ class CrossingLaw:
         exposure: DN at the pixel per DN of the light, for filter and walk.
         starts_at_rest: Whether the first event, too, is a threshold away from a known level: that of the first
             light.
+        known: Thresholds of each pixel where they were measured; None = mean and mismatch are those of all.
     """
 
     threshold_on: float
@@ -119,6 +150,37 @@ class CrossingLaw:
     floor_dn: float = 20.0
     exposure: float = 1.0
     starts_at_rest: bool = False
+    known: PixelMaps | None = field(default=None, compare=False)
+
+    def thresholds(self, pixels: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return mean and standard deviation of the thresholds of pixels, [2 P]: OFF and ON of each in turn.
+
+        Args:
+            pixels: Their number P, that of the measured ones where they were measured.
+        """
+        if self.known is None:
+            return np.tile([self.threshold_off, self.threshold_on], pixels), np.full(
+                2 * pixels, self.threshold_sigma
+            )
+        pairs = (self.known.off, self.known.on), (self.known.error_off, self.known.error_on)
+        mean, deviation = (np.stack(pair, axis=-1).ravel() for pair in pairs)
+        return mean, deviation
+
+    def doubted(self, error: float) -> CrossingLaw:
+        """Return the law where crossings of a pixel may share an error that its thresholds do not explain.
+
+        Args:
+            error: Its standard deviation, log units: no threshold is known better, nor less than unmeasured.
+        """
+        if (known := self.known) is None:
+            return self
+        most, errors = self.threshold_sigma, (known.error_on, known.error_off)
+        on, off = (np.minimum(np.hypot(one, error), np.maximum(one, most)) for one in errors)
+        return replace(self, known=replace(known, error_on=on, error_off=off))
+
+    def mapped(self, work: Callable[[NDArray], NDArray]) -> CrossingLaw:
+        """Return the law of other pixels where they were measured: the same is done to each of their maps."""
+        return self if self.known is None else replace(self, known=self.known.mapped(work))
 
     def level(self, light: NDArray) -> NDArray:
         """Return the log light of light in DN, [...]."""

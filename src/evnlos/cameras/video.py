@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from evnlos.cameras.event_camera import EventStream
-from evnlos.cameras.event_model import PixelSettings
+from evnlos.cameras.event_model import PixelMaps, PixelSettings
 from evnlos.cameras.frame_camera import FrameCamera
 from evnlos.cameras.pixel import EventPixel, Mode
 from evnlos.cameras.video_files import (
@@ -171,6 +171,7 @@ def video_events(
     pixel: PixelSettings | None = None,
     mode: Mode = "exact",
     seed: int = 0,
+    maps: PixelMaps | None = None,
 ) -> Iterator[Events]:
     """Yield the events of a video in order, piece by piece, in memory that does not grow with its length.
 
@@ -181,6 +182,7 @@ def video_events(
         pixel: Settings of the pixels, of any kind; None = the paper's.
         mode: "exact" or "v2e", as in `simulate_events`.
         seed: Seed of mismatch and noise.
+        maps: Measured thresholds of the sensor; None draws them.
 
     Raises:
         DataError: Fewer than two frames, frames of unequal size, or times that do not ascend.
@@ -198,7 +200,7 @@ def video_events(
     count = 0
     for times_s, block in _blocks(frames):
         if stream is None:
-            stream = EventStream(pixel, (block.shape[1], block.shape[2]), mode=mode, seed=seed)
+            stream = EventStream(pixel, (block.shape[1], block.shape[2]), mode=mode, seed=seed, thresholds=maps)
         stream.push(block, times_s)
         count += len(block)
         merged = _merged(held, stream.finish())
@@ -356,9 +358,7 @@ def _working_size(scale: str | None, size: tuple[int, int]) -> tuple[int, int]:
     if not (1 <= width <= 16_384 and 1 <= height <= 16_384):
         raise ConfigError(f"scale {scale} makes {width} x {height} pixels; give sides of 1 to 16384")
     if width * height > MOST_SENSOR_PIXELS:
-        raise ConfigError(
-            f"scale {scale} makes {width} x {height} pixels; at most {MOST_SENSOR_PIXELS:,} are simulated"
-        )
+        raise ConfigError(f"scale {scale} makes {width} x {height} pixels; give at most {MOST_SENSOR_PIXELS:,}")
     return width, height
 
 

@@ -20,10 +20,11 @@ from evnlos.calibration.pixel_fit import PixelFitSettings
 from evnlos.calibration.scan.film import FilmReading
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
-from evnlos.cameras import load_pixel
+from evnlos.cameras import PIXEL_MAPS_FILE, load_pixel, load_pixel_maps
 from evnlos.cli.parsing import check_files, check_out, check_there, drawn, refuse_existing, say
 from evnlos.cli.recordings import Flat, Folders, Force, Presets
 from evnlos.config import to_dict
+from evnlos.files import write_atomically
 from evnlos.lab import Phone
 from evnlos.machine import ProgressBars
 from evnlos.setups import load_setup
@@ -54,7 +55,7 @@ class CalibrateCommand:
     `calibrate`."""
     pixel: str | None = None
     """The camera's event pixel, known from `evnlos pixel fit`: its YAML file or a preset's name. It is kept,
-    and not fitted behind the wall."""
+    and not fitted behind the wall. Thresholds of each pixel beside that file go to the folder with it."""
     force: bool = False
     """Write the setup file also where the fit fails on the held-out captures, or where one exists."""
     json: bool = False
@@ -91,6 +92,13 @@ class CalibrateCommand:
         with ProgressBars() as progress:
             fit = calibrate(
                 self.captures, self.out, self.settings, force=self.force, look=self._show, progress=progress
+            )
+        maps = None if self.pixel is None else load_pixel_maps(self.pixel)
+        if maps is None:  # those of an earlier pixel
+            (self.out / PIXEL_MAPS_FILE).unlink(missing_ok=True)
+        elif self.pixel is not None:
+            write_atomically(
+                self.out / PIXEL_MAPS_FILE, (Path(self.pixel).parent / PIXEL_MAPS_FILE).read_bytes()
             )
         if not self.json:
             training = self.out / TRAINING_FILE
@@ -329,7 +337,8 @@ class PixelCommand:
     """Event file, capture folder with registered frames, or a YAML manifest of several recordings
     (`recordings: [{file: led.raw, light: {kind: sine, frequency_hz: 10, contrast: 0.5}}, ...]`)."""
     out: OutFolder
-    """Folder for pixel.yaml, pixel_fit.json, pixel_maps.npz and pixel_fit.png."""
+    """Folder for pixel.yaml, pixel_fit.json, pixel_maps.npz and pixel_fit.png; the maps are the thresholds of
+    each pixel, which `evnlos events`, `calibrate` and `invert` take where they find them beside --pixel."""
     light: tuple[str, ...] = ()
     """Light of the recording: static LEVEL, sine HZ CONTRAST [LEVEL], square HZ CONTRAST [LEVEL], edge RATIO
     PX_PER_S [DIRECTION_DEG], frames [FILE], or unknown. Of a capture folder its frames by default."""

@@ -17,8 +17,9 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from evnlos.cameras.event_model import Phase, PixelSettings
+from evnlos.cameras.event_model import Phase, PixelMaps, PixelSettings
 from evnlos.cameras.pixel import Logarithm, Mode
+from evnlos.cameras.pixels.arrays import load_pixel_maps
 from evnlos.cameras.sensors import load_pixel
 from evnlos.cameras.video import Tone, Video, check_paths, check_video, open_video, video_events
 from evnlos.cli.parsing import UnfitWordsError, check_files, refuse_existing, say
@@ -115,7 +116,8 @@ class EventsCommand:
     videos a folder, with an .h5 file for each; those that are there already are kept."""
     pixel: str = "davis346"
     """paper, v2e_clean, v2e_noisy, davis346, prophesee_gen3, prophesee_gen4, celex_v, voltmeter_dvs346,
-    voltmeter_dvs240, or a YAML file with the settings of any event model (`kind`)."""
+    voltmeter_dvs240, or a YAML file with the settings of any event model (`kind`). Where `evnlos pixel fit`
+    measured the thresholds of each pixel of a sensor of the video's size, it is this sensor that sees it."""
     changes: Annotated[PixelChanges, tyro.conf.arg(name="pixel")] = field(default_factory=PixelChanges)
     """Parameters in place of the preset's, which stand where none is given."""
     mode: Mode = "exact"
@@ -180,6 +182,7 @@ class EventsCommand:
         )
         if not self.force:
             check_video(video, pixel)
+        maps = self._measured((video.height, video.width))
         on = instants = 0
         last_us = -1
         clock = _Clock(self.start, self.stop)
@@ -187,19 +190,30 @@ class EventsCommand:
         with writer, ProgressBars() as progress:
             writer.write(Events.empty(video.width, video.height))
             watched = clock.watched(video, self.out.name, progress)
-            for piece in video_events(watched, pixel, self.mode, self.seed):
+            for piece in video_events(watched, pixel, self.mode, self.seed, maps):
                 writer.write(piece)
                 on += int(piece.p.sum())
                 if len(piece):
                     instants += int((np.diff(piece.t_us, prepend=last_us) != 0).sum())
                     last_us = int(piece.t_us[-1])
-        found = _found(self, video, pixel, clock, writer.events, on) | {"instants": instants}
+        found = _found(self, video, pixel, clock, writer.events, on)
+        found |= {"instants": instants, "measured_thresholds": maps is not None}
         if self.preview and look:
             if writer.events:
                 write_preview(Recording(self.out), CropOptions(), self.preview, look)
             else:
                 say(f"note: no events, so no {self.preview}")
         print(json.dumps(found) if self.json else _text(found))
+
+    def _measured(self, shape: tuple[int, int]) -> PixelMaps | None:
+        """Return measured thresholds of a sensor of the video's size, unless flags say others."""
+        maps, own = load_pixel_maps(self.pixel), self.changes
+        if maps is None or maps.hot.shape == shape:
+            stated = (own.threshold_on, own.threshold_off, own.threshold_sigma, own.pattern_seed)
+            return maps if all(one is None for one in stated) else None
+        height, width = maps.hot.shape
+        say(f"note: thresholds are drawn: those of {self.pixel} were measured on {width} x {height} pixels")
+        return None
 
 
 class _Clock:
@@ -262,6 +276,7 @@ def _found(
 
 def _text(found: dict[str, Any]) -> str:
     ratio = f"{found['on_off_ratio']:.2f}" if found["on_off_ratio"] is not None else "no OFF events"
+    sensor = ", its measured thresholds" if found["measured_thresholds"] else ""
     rate = f"{amount(found['rate_hz'], 'ev/s')}, {found['rate_per_pixel_hz']:.3g} Hz per pixel"
     times = "from --fps" if found["times_from"] == "fps" else "from the file"
     return (
@@ -269,7 +284,7 @@ def _text(found: dict[str, Any]) -> str:
         f"  {100 * found['instants'] / max(found['events'], 1):.0f} different times per 100 events\n"
         f"  {found['frames']} frames of {found['width']} x {found['height']} in {found['duration_s']:.6g} s, "
         f"times {times}, tone {found['tone']}\n"
-        f"  pixel {found['pixel_name']}, mode {found['mode']}, seed {found['seed']}; "
+        f"  pixel {found['pixel_name']}{sensor}, mode {found['mode']}, seed {found['seed']}; "
         f"to look at it: evnlos preview {found['out']}"
     )
 

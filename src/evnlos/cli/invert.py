@@ -53,6 +53,10 @@ class InvertCommand:
     pattern: Path | None = None
     """Captures: the camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup. By
     default that of a calibrated --setup."""
+    pixel: str | None = None
+    """With --from events or both: the event pixel instead of the setup's, a YAML file as `evnlos pixel fit`
+    writes it, or a preset's name. Thresholds of each pixel that lie beside it, or in the folder of a calibrated
+    --setup, count as known, and hot pixels are left out."""
     track: bool = False
     """Captures: find the motion in the recording also where capture.yaml states it."""
     static: float | None = None
@@ -113,6 +117,8 @@ class InvertCommand:
             raise ConfigError("--colours takes captures with a --setup; leave --samples, --changing, --pattern")
         if self.samples and self.evidence is None:
             raise ConfigError(f"--samples {self.samples} takes --from frames, events or both; give one of them")
+        if self.pixel is not None and self.evidence not in ("events", "both"):
+            raise ConfigError(f"--pixel {self.pixel} takes --setup, and --from events or both")
         if self.setup is not None:
             still = all(path.is_file() for path in self.files)
             (self._invert_stills if still else self._invert_captures)(self.setup)
@@ -241,7 +247,7 @@ class InvertCommand:
         from evnlos.models import estimate_film_of
         from evnlos.plot.results import draw_inversion
         from evnlos.report.pictures import grey, save_animation
-        from evnlos.setups.load import linear_setup
+        from evnlos.setups.load import measured_setup
 
         refuse_existing(self.force, film := self.out.with_suffix(".gif"))
         if len(self.files) != 1 or self.samples or self.positions or self.track:
@@ -249,11 +255,11 @@ class InvertCommand:
         plane = film_plane(sides_m, self.cells)
         clock = time.perf_counter()
         evidence = self.evidence or "frames"
-        setup, capture = linear_setup(word), capture_of(self.files[0], evidence)
+        (setup, maps), capture = measured_setup(word, self.pixel), capture_of(self.files[0], evidence)
         pattern = None if evidence == "events" else pattern_of(word, self.pattern)
         how = evidence, pattern, self.columns, self.static
         with ProgressBars() as progress:
-            found = estimate_film_of(capture, setup, plane, *how, progress)
+            found = estimate_film_of(capture, setup, plane, *how, progress, maps)
         shown = np.linspace(0, len(found.mean) - 1, min(6, len(found.mean))).round().astype(int)
         panels = [(f"{found.times_s[k]:.2f} s", torch.from_numpy(found.mean[k])[None]) for k in shown]
         result: dict[str, Any] = {
@@ -287,8 +293,8 @@ class InvertCommand:
         if self.track and self.colours:  # each colour would be centred on its own light
             raise ConfigError("--colours needs a motion that is known; leave it or --track")
         with ProgressBars() as progress:
-            how = evidence, self.pattern, self.samples
-            found, pictures = estimate_captures(self.files, setup, *how, progress, self.colours, self.track)
+            how = evidence, self.pattern, self.samples, progress, self.colours, self.track, self.pixel
+            found, pictures = estimate_captures(self.files, setup, *how)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
         panels, side_m = estimate_panels(found["rows"], pictures)

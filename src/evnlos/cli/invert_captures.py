@@ -34,7 +34,7 @@ from evnlos.inverse.tikhonov import Rule
 from evnlos.machine import Progress, Step, counted, silent
 from evnlos.models import TargetEstimate, estimate_target, load_prior
 from evnlos.setups import Setup
-from evnlos.setups.load import linear_setup
+from evnlos.setups.load import linear_setup, measured_setup
 from evnlos.tracking import temporal_noise
 from evnlos.types import COLOURS, Colour, Evidence, Plane
 
@@ -270,6 +270,7 @@ def estimate_captures(
     progress: Progress = silent,
     colours: bool = False,
     track: bool = False,
+    pixel: str | None = None,
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and of each capture the target [cells, cells] and its standard deviation, by name.
 
@@ -283,20 +284,20 @@ def estimate_captures(
         progress: Called as each capture is done.
         colours: Whether the target is solved in red, green and blue: [3, cells, cells].
         track: Whether the motion is found, by frames where they count, also where it is stated.
+        pixel: The event pixel instead of the setup's, as `--pixel` takes it.
 
     Raises:
         ConfigError: The setup is not linear or has no law of events, a motion is unknown, or colours are grey.
     """
-    setup, prior = linear_setup(word), load_prior() if samples else None
+    (setup, maps), prior = measured_setup(word, pixel), load_prior() if samples else None
     removed = None if colours or evidence == "events" else pattern_of(word, pattern)
     how = evidence, removed, prior, samples, SequenceLights()
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
         seen = _read_colours(folder, evidence) if colours else {None: capture_of(folder, evidence)}
-        one = seen.get(None)
-        if one is not None and _is_tracked(one, track):
+        if (one := seen.get(None)) is not None and _is_tracked(one, track):
             seen = {None: _followed(one, setup, by_frames=evidence != "events")}
-        each = [estimate_target(one, setup, *how, colour) for colour, one in seen.items()]
+        each = [estimate_target(one, setup, *how, colour, maps) for colour, one in seen.items()]
         parts = [_row(*pair) for pair in zip(seen.values(), each, strict=True)]
         rows.append(_row_of_colours(parts) if colours else parts[0])
         parted = {(name := parts[0]["capture"]): [torch.from_numpy(one.image) for one in each]}

@@ -2,6 +2,7 @@
 
 - A dark frame and a flat field, as a capture's folder holds them; frames on the event camera's pixels.
 - The fixed pattern that a calibration found, its file, and where a setup has it.
+- The thresholds of the event pixels that a capture uses, where the sensor was measured.
 - What is left of frames without the setup's ambient light.
 """
 
@@ -12,23 +13,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras import colour_filters
+from evnlos.cameras import PixelMaps
 from evnlos.data.capture_info import CaptureInfo, inside
-from evnlos.data.frames import FrameSeries, map_points, read_image
+from evnlos.data.frames import FrameSeries, map_points, of_used, read_image, stride_of
 from evnlos.data.sampling import frame_homography, reduce_by_area
-from evnlos.errors import ConfigError, DataError
-from evnlos.events import FrameStack, crop_events, stride_for, thin_events
+from evnlos.errors import DataError
+from evnlos.events import FrameStack, crop_events, thin_events
 from evnlos.files import write_atomically
 from evnlos.setups import Setup
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
-from evnlos.types import COLOURS, Colour, Events
+from evnlos.types import Events
 from evnlos.untrusted import check_memory
 
 
@@ -185,14 +186,6 @@ def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tupl
     return mapped(frames, prepared), notes
 
 
-_MANY_PIXELS, _ENOUGH_PIXELS = 300_000, 40_000
-
-
-def _stride(info: CaptureInfo, pixels: int) -> int:
-    """Return of which so many rows and columns of a region of some pixels one is used."""
-    return info.every or (stride_for(pixels, _ENOUGH_PIXELS) if pixels > _MANY_PIXELS else 1)
-
-
 def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events, Any, list[str]]:
     """Return events and frames of what is used of the sensor: a region, and every so many pixels of it.
 
@@ -204,7 +197,7 @@ def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events,
         events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
         frames = mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
         notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
-    if (side := _stride(info, events.width * events.height)) > 1:
+    if (side := stride_of(info, events.width * events.height)) > 1:
         rows, columns = (length // side for length in events.shape)
         if not rows or not columns:
             raise DataError(f"every is {side}, and {events.width} x {events.height} pixels are used; give less")
@@ -218,35 +211,6 @@ def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events,
         frames = mapped(frames, binned)
         notes.append(f"every {side} rows and columns: {columns} x {rows} pixels")
     return events, frames, notes
-
-
-def own_pixels(info: CaptureInfo, colour: Colour, kind: Literal["frames", "events"]) -> NDArray[np.bool_]:
-    """Return which of the used pixels see a colour by themselves, bool [H, W].
-
-    Behind a mosaic all others of frames are interpolated. Registered, turned or averaged frames have no such
-    pixels; there one of four (of two for green) is taken.
-
-    Args:
-        info: What is known about the capture.
-        colour: The colour.
-        kind: Pixels of which camera; whole coloured frames have the colour everywhere.
-
-    Raises:
-        ConfigError: The event camera has no filters, or no used pixel has this one.
-    """
-    camera, seen = info.camera, np.ones((info.camera.height, info.camera.width), np.bool_)
-    if (mosaic := camera.mosaic if kind == "frames" else camera.event_mosaic) is not None:
-        seen = colour_filters(mosaic, seen.shape)[COLOURS.index(colour)]
-    elif kind == "events":
-        raise ConfigError("its events are grey; leave --colours or --from, or state camera.event_mosaic")
-    if (roi := info.roi) is not None:
-        seen = seen[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width]
-    if (side := _stride(info, seen.size)) > 1:
-        rows, columns = (length // side * side for length in seen.shape)
-        seen = seen[side // 2 : rows : side, side // 2 : columns : side]
-    if not seen.any():
-        raise ConfigError(f"no pixel for {colour} among every {side} rows and columns; state an odd `every`")
-    return seen
 
 
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less
@@ -349,6 +313,28 @@ def pattern_of(setup: str | Path | None, pattern: str | Path | None = None) -> F
     folder = Path(setup) if Path(setup).is_dir() else Path(setup).parent
     names_folder = folder == Path(setup) or Path(setup).suffix in (".yaml", ".yml")
     return load_pattern(folder) if names_folder and (folder / PATTERN_FILE).is_file() else None
+
+
+def used_maps(maps: PixelMaps | None, info: CaptureInfo, shape: tuple[int, int]) -> PixelMaps | None:
+    """Return the measured thresholds of the event pixels that a capture uses, [h, w], if there are any.
+
+    Args:
+        maps: Those of the whole sensor, or of the pixels that are used.
+        info: What is known about the capture.
+        shape: Rows and columns of the pixels that are used.
+
+    Raises:
+        DataError: They are of another camera.
+    """
+    if maps is None or maps.hot.shape == shape:
+        return maps
+    (height, width), camera = maps.hot.shape, info.camera
+    if (height, width) != (camera.height, camera.width):
+        raise DataError(
+            f"the measured thresholds are of {width} x {height} pixels, the event camera has {camera.width} x "
+            f"{camera.height}; give the pixel that was fitted to this camera"
+        )
+    return maps.mapped(partial(of_used, info))
 
 
 PATTERN_FILE = "pattern.safetensors"

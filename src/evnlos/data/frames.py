@@ -2,6 +2,7 @@
 
 - A homography from points.
 - A grid of bright dots, as a screen or a board of lamps shows it, found in a frame or in a map of events.
+- Which pixels of the sensor a capture uses, and which of them see a colour by themselves.
 """
 
 from __future__ import annotations
@@ -11,19 +12,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 
-from evnlos.cameras.frame_camera import of_mosaic
+from evnlos.cameras.frame_camera import colour_filters, of_mosaic
 from evnlos.cameras.video import open_video
 from evnlos.cameras.video_files import Tone, to_light
 from evnlos.data.capture_info import CaptureInfo, inside
-from evnlos.errors import DataError
-from evnlos.events import FrameReader, FrameStack, gather_frames, iter_frames
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import FrameReader, FrameStack, gather_frames, iter_frames, stride_for
 from evnlos.types import COLOURS, Colour, Events, Mosaic
 from evnlos.untrusted import check_memory, memory_left, open_image, open_regular
 
@@ -437,3 +438,56 @@ def find_dots(picture: NDArray, rows: int, columns: int) -> NDArray[np.float64]:
     if away > _OFF_GRID or sorted(order) != list(range(count)):
         raise DataError(f"the dots form no grid of {rows} x {columns}; check its rows and columns")
     return centres[np.argsort(order)]
+
+
+_MANY_PIXELS, _ENOUGH_PIXELS = 300_000, 40_000
+
+
+def stride_of(info: CaptureInfo, pixels: int) -> int:
+    """Return of which so many rows and columns of a region of some pixels one is used.
+
+    Args:
+        info: What is known about the capture.
+        pixels: Pixels of the region.
+    """
+    return info.every or (stride_for(pixels, _ENOUGH_PIXELS) if pixels > _MANY_PIXELS else 1)
+
+
+def of_used(info: CaptureInfo, values: NDArray) -> NDArray:
+    """Return what belongs to each pixel of a sensor, where a capture uses its events, [H, W] -> [h, w].
+
+    Args:
+        info: What is known about the capture.
+        values: Of the whole sensor, [H, W].
+    """
+    if (roi := info.roi) is not None:
+        values = values[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width]
+    if (side := stride_of(info, values.size)) > 1:
+        rows, columns = (length // side * side for length in values.shape)
+        values = values[side // 2 : rows : side, side // 2 : columns : side]
+    return values
+
+
+def own_pixels(info: CaptureInfo, colour: Colour, kind: Literal["frames", "events"]) -> NDArray[np.bool_]:
+    """Return which of the used pixels see a colour by themselves, bool [H, W].
+
+    Behind a mosaic all others of frames are interpolated. Registered, turned or averaged frames have no such
+    pixels; there one of four (of two for green) is taken.
+
+    Args:
+        info: What is known about the capture.
+        colour: The colour.
+        kind: Pixels of which camera; whole coloured frames have the colour everywhere.
+
+    Raises:
+        ConfigError: The event camera has no filters, or no used pixel has this one.
+    """
+    camera, seen = info.camera, np.ones((info.camera.height, info.camera.width), np.bool_)
+    if (mosaic := camera.mosaic if kind == "frames" else camera.event_mosaic) is not None:
+        seen = colour_filters(mosaic, seen.shape)[COLOURS.index(colour)]
+    elif kind == "events":
+        raise ConfigError("its events are grey; leave --colours or --from, or state camera.event_mosaic")
+    seen = of_used(info, seen)
+    if not seen.any():
+        raise ConfigError(f"no pixel for {colour} among the rows and columns used; state an odd `every`")
+    return seen

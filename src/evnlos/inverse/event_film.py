@@ -93,13 +93,13 @@ class NodeSums(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def add_rows(rows: FilmRows, first: int, spread: float, out: NodeSums):
+def add_rows(rows: FilmRows, first: int, spread: Array, out: NodeSums):
     """Add rows to the sums of their pixels: M += w tau tau^T, of each group less s^2 / (1 + s^2 sum w) g g^T.
 
     | symbol | meaning |
     |---|---|
     | rows | rows of the pixels from `first` on, each pixel's and each group's side by side |
-    | spread | s, standard deviation of a threshold over the pixels, log units |
+    | spread | s, standard deviation of what is not known of the threshold of each group, log units |
     | g, total, seen | sum of w tau, of w and of w y over the rows of a group |
     | out | sums of these pixels |
     """
@@ -122,7 +122,8 @@ def add_rows(rows: FilmRows, first: int, spread: float, out: NodeSums):
         seen += w * rows.residual[n]
         if n + 1 < len(rows.pixel) and rows.group[n + 1] == rows.group[n]:
             continue
-        share = spread * spread / (1.0 + spread * spread * total)
+        variance = spread[rows.group[n]] ** 2
+        share = variance / (1.0 + variance * total)
         for j in range(nodes):
             if g[j] != 0.0:
                 out.score[i, j] -= share * seen * g[j]
@@ -236,13 +237,14 @@ def estimate_event_film(
     light = FilmLight.of(matrix @ cells, ambient[:, None] + matrix @ rest.T, times, shape)
     own = _precision(found, times, wave_numbers(cells, plane))
     known = None if frames is None else _of_frames(frames, cells, rest, times)
+    law = law.doubted(settings.least_noise)
     trust, annealed = np.ones(len(record)), max(settings.iterations - _SETTLED, 1)
     factor = np.empty((0, 0)), True
     turns, spread = range(settings.iterations), found.deviation * math.hypot(1.0, found.resting)
     for turn in counted(turns, progress, "estimate the film", len(turns), "turns"):
         least = float(settings.noise_in(turn, annealed))
         rows = rows_of(light, law, record, w, least, trust)
-        total = film_equations(film_rows(light, record, rows), light, law.threshold_sigma)
+        total = film_equations(film_rows(light, record, rows), light, law.thresholds(len(light.left))[1])
         if known is None:
             _hold_up(total, w, cells, rest)
         else:
@@ -307,13 +309,13 @@ def film_rows(light: FilmLight, record: EventRecord, rows: EventRows) -> FilmRow
     return FilmRows(*columns)
 
 
-def film_equations(rows: FilmRows, light: FilmLight, spread: float) -> NormalEquations:
+def film_equations(rows: FilmRows, light: FilmLight, spread: Array) -> NormalEquations:
     """Return what rows say of a film w [T K]: sums over pixels of a a^T (x) M.
 
     Args:
         rows: The rows.
         light: The light, for what pixels see of modes.
-        spread: Standard deviation of a threshold over the pixels, log units.
+        spread: Standard deviation of what is not known of each threshold, log units, [2 P]: OFF, ON in turn.
     """
     count, modes = len(light.times_s), light.left.shape[1]
     (j, k), (a, b) = np.tril_indices(count), np.tril_indices(modes)

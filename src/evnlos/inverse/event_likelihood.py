@@ -3,7 +3,9 @@
 With z the coefficients of the Gaussian prior and L(i, t; z) the filtered log light of pixel i:
 - Between two events of a pixel, L (with the leak's share) moves by D = +theta_on or -theta_off, less what noise
   carries both ahead (`CrossingLaw.ahead`), with the error of a crossing. What a pixel's own thresholds differ
-  from the mean is integrated out in closed form, by polarity.
+  from their mean is integrated out in closed form, by polarity: the mean of all pixels and the mismatch, or
+  where the sensor was measured (`CrossingLaw.known`) each pixel's own mean and the error of that. What error of
+  a crossing is taken for granted may be one of the pixel, as that of its light is: it counts there, too.
 - What is observed is a time: the level's density times |dD/dt|, without which contrasts come out too low.
 - The error of a crossing is estimated, from events of a pixel and polarity; too large, contrasts are too high.
 - An event is a signal or noise: that density, by what the pixel's other events say of its threshold, or the
@@ -150,24 +152,25 @@ def estimate_sequence(
         raise ConfigError("events without the law of their pixels; the event model states no crossing_law")
     settings = settings or LikelihoodSettings()
     count = prior.count
-    own = np.eye(count)
+    unit = np.eye(count)
     if record is None or law is None:
         assert frames is not None
-        covariance = np.asarray(np.linalg.inv(own + frames.normal.information), np.float64)
+        covariance = np.asarray(np.linalg.inv(unit + frames.normal.information), np.float64)
         return _finished(
             prior, covariance @ frames.normal.score, covariance, np.zeros(_NUISANCES), math.nan, math.nan
         )
-    unknown = np.zeros(count + _NUISANCES)
+    law, unknown = law.doubted(settings.least_noise), np.zeros(count + _NUISANCES)
     if start is not None:
         unknown[:count] = start
     elif frames is not None:
-        unknown[:count] = np.linalg.solve(own + frames.normal.information, frames.normal.score)
+        unknown[:count] = np.linalg.solve(unit + frames.normal.information, frames.normal.score)
     near = replace(settings, first_noise=min(settings.first_noise, _NEAR_NOISE))
     if start is not None:
         settings = near
     elif frames is None and (stride := stride_for(len(light.left), _FIRST_PIXELS)) > 1:
         few, those = light.every(stride, _FIRST_RANK), record.every(stride, light.shape[1])
-        _annealed(few, law, those, None, unknown, replace(settings, iterations=FIRST_STEPS))
+        own = law.mapped(lambda one: one[::stride, ::stride])
+        _annealed(few, own, those, None, unknown, replace(settings, iterations=FIRST_STEPS))
         settings = replace(near, iterations=max((settings.iterations + 2) // 3, 2))
     total, trust, noise = _annealed(light, law, record, frames, unknown, settings)
     covariance = np.asarray(np.linalg.inv(total.information)[:count, :count], np.float64)
@@ -242,6 +245,7 @@ def _add_events(
     place = np.full(len(part), -1)  # in the whole record; references alone have none
     place[part.origin >= 0] = kept
     owner = record.pixel[together.at]
+    theta, spread = law.thresholds(len(light.left))
     for block, rows, rates in part.blocks(light, found.levels, most):
         mine = place[block]
         pixels = part.pixel[block]
@@ -251,11 +255,11 @@ def _add_events(
         named = np.flatnonzero(mine >= 0)
         row = named[np.searchsorted(mine[named], at)]
         extra = np.zeros((len(at), _NUISANCES))
-        extra[:, 0] = np.where(sign > 0, -law.threshold_on, 0.0)
-        extra[:, 1] = np.where(sign < 0, law.threshold_off, 0.0)
+        extra[:, 0] = np.where(sign > 0, -theta[group], 0.0)
+        extra[:, 1] = np.where(sign < 0, theta[group], 0.0)
         extra[:, 2] = wait[at]
         whole = np.concatenate([rows[row], extra], axis=1)
-        total.add(whole, together.weight[here], together.residual[here], group, law.threshold_sigma)
+        total.add(whole, together.weight[here], together.residual[here], group, spread[group])
         events = np.flatnonzero((mine >= 0) & record.measured[np.maximum(mine, 0)])
         at = mine[events]
         sloping = np.zeros((len(at), len(unknown)))
@@ -343,14 +347,15 @@ class EventState:
         levels: Levels,
     ) -> None:
         self.light, self.law, self.record, self.seen = light, law, record, seen
-        self.theta = law.threshold_on * (1 + nuisances[0]), law.threshold_off * (1 + nuisances[1])
+        theta, spread = law.thresholds(len(light.left))
+        self.theta, self.spread = theta * np.tile(1 + nuisances[1::-1], len(light.left)), spread**2  # [2 P]
+        self.group = 2 * record.pixel + (record.sign > 0)
         self.wait = record.t_s - record.t_s[record.origin]
         self.change = record.change(light, levels) + nuisances[2] * self.wait
-        self.residual = np.where(record.sign > 0, self.theta[0], -self.theta[1]) - self.change
+        self.residual = np.where(record.sign > 0, 1.0, -1.0) * self.theta[self.group] - self.change
         self.residual -= law.lead(record.sign, record.sign[record.origin])
         self.noise = math.hypot(noise, law.noise)
         self.variance = record.variance(light, seen, law, noise)
-        self.group = 2 * record.pixel + (record.sign > 0)
         node, _ = light.place(record.t_s)
         step = light.times_s[1] - light.times_s[0]
         rate = (levels.value[record.pixel, node + 1] - levels.value[record.pixel, node]) / step
@@ -362,8 +367,7 @@ class EventState:
         measured = np.flatnonzero(self.record.measured)
         of, size = self.group[measured], 2 * len(self.light.left)
         weight = trust[measured] / self.variance[measured]
-        spread = self.law.threshold_sigma**2
-        variance = np.asarray(spread / (1.0 + spread * np.bincount(of, weight, size)), np.float64)
+        variance = np.asarray(self.spread / (1.0 + self.spread * np.bincount(of, weight, size)), np.float64)
         mean = -variance * np.bincount(of, weight * self.residual[measured], size)
         return np.asarray(mean, np.float64), variance
 
@@ -388,7 +392,7 @@ class EventState:
         measured = np.flatnonzero(self.record.measured)
         of, size = self.group[measured], 2 * len(self.light.left)
         sums = np.maximum(np.bincount(of, trust[measured], size), 1.0)
-        own, seen, spread = self.noise**2, min(scatter, self.noise) ** 2, self.law.threshold_sigma**2
+        own, seen, spread = self.noise**2, min(scatter, self.noise) ** 2, self.spread
         shared = (spread + seen / sums) / (spread + own / sums)
         return ((shared + (sums - 1.0) * seen / own) / sums)[self.group]
 
@@ -397,7 +401,7 @@ class EventState:
         measured = np.flatnonzero(self.record.measured)
         # by the group's other events: with its own say each would confirm itself
         of, residual, own = self.group[measured], self.residual[measured], self.variance[measured]
-        weight, mismatch = trust[measured] / own, self.law.threshold_sigma**2
+        weight, mismatch = trust[measured] / own, self.spread[of]
         known, seen = (
             np.bincount(of, column, 2 * len(self.light.left))[of] for column in (weight, weight * residual)
         )
@@ -437,7 +441,9 @@ class EventState:
         order = free[np.lexsort((-sign * self.change[free], record.origin[free]))]
         at = order[np.diff(record.origin[order], prepend=-1) != 0]
         offset, variance = (column[2 * record.pixel[at] + (sign > 0)] for column in self.offsets(trust))
-        theta = self.theta[0 if sign > 0 else 1] - sign * self.law.lead(sign, record.sign[record.origin[at]])
+        theta = self.theta[2 * record.pixel[at] + (sign > 0)] - sign * self.law.lead(
+            sign, record.sign[record.origin[at]]
+        )
         room = theta + sign * offset - sign * self.change[at]
         width = np.sqrt(variance + self.noise**2)
         scaled = torch.from_numpy(room / width)

@@ -180,7 +180,8 @@ def record_of(
     """Return the record of a stream: each event measured from the one before it in its pixel.
 
     With pixels that start at rest the first one is measured from the first light. In gaps longer than `gap_s`,
-    and at the end, instants without an event stand for the silence.
+    and at the end, instants without an event stand for the silence. Pixels that are known to fire without cause
+    are left out.
 
     Args:
         events: The stream, on the clock of `span_s`.
@@ -188,11 +189,13 @@ def record_of(
         span_s: First and last instant of the sequence, seconds; events outside are left out.
         gap_s: Longest time without an instant, seconds; infinity = no silences but the one at the end.
     """
-    count = events.width * events.height
     t_s = events.t_us * 1e-6
     inside = (t_s > span_s[0]) & (t_s <= span_s[1])
-    pixel = (events.y.astype(np.int64) * events.width + events.x)[inside]
-    everywhere = np.arange(count)
+    everywhere = np.arange(events.width * events.height)
+    if law.known is not None:
+        inside &= ~law.known.hot[events.y, events.x]
+        everywhere = np.flatnonzero(~law.known.hot)
+    count, pixel = len(everywhere), (events.y.astype(np.int64) * events.width + events.x)[inside]
     sign = np.where(events.p[inside], 1, -1).astype(np.int8)
     return _assembled(
         np.concatenate([everywhere, pixel, everywhere]),

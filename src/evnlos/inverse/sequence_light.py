@@ -294,7 +294,7 @@ class NormalEquations:
         """Return no information about `count` unknowns."""
         return cls(np.zeros((count, count)), np.zeros(count))
 
-    def add(self, rows: Array, weight: Array, residual: Array, group: NDArray[np.int64], spread: float) -> None:
+    def add(self, rows: Array, weight: Array, residual: Array, group: NDArray, spread: Array | float) -> None:
         """Add rows; those of one group lie side by side, and all of them are in one call.
 
         Args:
@@ -302,7 +302,7 @@ class NormalEquations:
             weight: 1 / variance, [N].
             residual: y, [N].
             group: Number of each row's group, [N], equal ones side by side.
-            spread: s, standard deviation of the offset that a group shares; 0 = none.
+            spread: s, standard deviation of the offset that a group shares, one or each row's, [N]; 0 = none.
         """
         if not len(rows):
             return
@@ -310,11 +310,11 @@ class NormalEquations:
         scaled = rows * root[:, None]
         self.information += scaled.T @ scaled  # a matrix by itself takes half of the work
         self.score += scaled.T @ (root * residual)
-        if spread > 0:
+        if np.any(spread):
             starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
             total, seen = (np.add.reduceat(column, starts) for column in (weight, weight * residual))
             summed = np.add.reduceat(scaled * root[:, None], starts)  # [groups, k]
-            self.subtract_offsets(summed, total, np.full(len(total), spread), seen)
+            self.subtract_offsets(summed, total, np.broadcast_to(spread, len(group))[starts], seen)
 
     def subtract_offsets(
         self, summed: Array, weights: Array, spread: Array, residual: Array | float = 0.0

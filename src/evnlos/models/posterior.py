@@ -36,9 +36,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from evnlos.cameras import PixelMaps
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data import Capture, FixedPattern
-from evnlos.data.fixed_pattern import object_light, own_pixels
+from evnlos.data.fixed_pattern import object_light, used_maps
+from evnlos.data.frames import own_pixels
 from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse import (
     TRACKED_ROOM,
@@ -99,9 +101,8 @@ class AboutPrior:
 
     def __post_init__(self) -> None:
         if not (1 <= self.width <= 512 and 4 <= self.cells <= 256):
-            raise ConfigError(
-                f"a prior of {self.width} channels on {self.cells} cells; give 1 to 512, and 4 to 256"
-            )
+            sizes = f"{self.width} channels on {self.cells} cells"
+            raise ConfigError(f"a prior of {sizes}; give 1 to 512, and 4 to 256")
         if not 0 < self.least_noise < self.most_noise < math.inf:
             raise ConfigError(f"noise from {self.least_noise} to {self.most_noise}; give two ascending numbers")
 
@@ -192,9 +193,7 @@ def load_prior(word: str | Path = "targets") -> LearnedPrior:
     """
     if Path(word).is_file():
         return PRIOR.load(word, "")
-    known = {
-        path.stem: path for folder in weights_folders() for path in (folder / _FOLDER).glob("*.safetensors")
-    }
+    known = {one.stem: one for at in weights_folders() for one in (at / _FOLDER).glob("*.safetensors")}
     if str(word) not in known:
         names = f"one of {', '.join(sorted(known))}" if known else "install evnlos-weights"
         raise UnknownNameError(f"there is no learned prior {str(word)!r}; give a file, or {names}")
@@ -224,10 +223,7 @@ class TargetLikelihood:
 
 
 def posterior_samples(
-    prior: LearnedPrior,
-    likelihood: TargetLikelihood,
-    count: int = 32,
-    seed: int = 0,
+    prior: LearnedPrior, likelihood: TargetLikelihood, count: int = 32, seed: int = 0
 ) -> Tensor:
     """Return targets that a measurement and a learned prior allow, float32 [count, h, w], 0..1.
 
@@ -319,6 +315,7 @@ def estimate_target(
     samples: int = 32,
     lights: SequenceLights | None = None,
     colour: Colour | None = None,
+    maps: PixelMaps | None = None,
 ) -> TargetEstimate:
     """Return the target of a capture whose motion is known, from the one likelihood of its whole sequence.
 
@@ -338,10 +335,12 @@ def estimate_target(
         samples: Samples under a learned prior.
         lights: Lights of the setup's sequences, kept from call to call.
         colour: The colour, in which the frames were read if they count; None is what all pixels see, as grey.
+        maps: Measured thresholds of the event camera; None: all that is known of them is the setup's.
 
     Raises:
         ConfigError: The motion is unknown, the event model states no law of its crossings, or no event pixel
             has a filter of the colour.
+        DataError: The maps are of another camera.
     """
     motion, size = capture.path, capture.info.target_size_m
     patterns = _PATTERNS if prior is None or evidence != "frames" else COEFFICIENTS
@@ -373,10 +372,10 @@ def estimate_target(
         frames = FrameTerm(shown, values, times, setup.frame_camera, pattern is not None, setup.frame_doubt)
     if evidence != "frames":
         light, own = behind("events")
-        law = setup.pixel.known_law(light.typical_dn)
+        law = replace(setup.pixel.known_law(light.typical_dn), known=used_maps(maps, capture.info, shape))
         record = record_of(capture.events, law, span, _GAP_S)
         if colour is not None:
-            kept = own[record.pixel]
+            kept, law = own[record.pixel], law.mapped(lambda one: one.ravel()[own][None])
             record = replace(record.of_pixels(kept), pixel=(np.cumsum(own) - 1)[record.pixel[kept]])
     found = estimate_sequence(light, basis, law, record, frames)
     image, deviation, error, drawn = found.image, found.deviation, found.expected_error, None
@@ -434,6 +433,7 @@ class FilmSolver:
         begins: bool = True,
         count: int | None = None,
         progress: Progress = silent,
+        maps: PixelMaps | None = None,
     ) -> FilmEstimate:
         """Return the film that frames, events, or both tell.
 
@@ -447,9 +447,9 @@ class FilmSolver:
             static: Standard deviation of a pixel's constant offset over its noise's; None: as the frames say.
             prior: The prior; None: as the frames say, or the one of events alone.
             begins: Whether the pixels of the event camera start with the first instant, or saw events before.
-            count: How many images events tell, from the first time to the last; None: one every tenth of a
-                second, or as many as times where these are more.
+            count: How many images events tell; None: one every tenth of a second, or as many as times.
             progress: Told the iterations.
+            maps: Measured thresholds of the event pixels that are used; None: they are not known.
 
         Raises:
             ConfigError: The event model states no law of its crossings.
@@ -473,7 +473,7 @@ class FilmSolver:
         size, span = events.shape, (float(times_s[0]), float(times_s[-1]))
         still = setup.seen_by(size).ambient_light(size)
         law = setup.pixel.known_law(WHITE_DN * float(still.mean()))
-        law = replace(law, starts_at_rest=law.starts_at_rest and begins)
+        law = replace(law, starts_at_rest=law.starts_at_rest and begins, known=maps)
         record = record_of(events, law, span, _GAP_S)
         count = count or max(len(times_s), round((span[1] - span[0]) / _FILM_STEP_S) + 1)
         seen = self.path(size, frames=False), still, record, law, np.linspace(*span, count)
@@ -569,6 +569,7 @@ def estimate_film_of(
     columns: int = 64,
     static: float | None = None,
     progress: Progress = silent,
+    maps: PixelMaps | None = None,
 ) -> FilmEstimate:
     """Return the film of a hidden plane that changes, from a capture of it.
 
@@ -576,16 +577,16 @@ def estimate_film_of(
         capture: The recording; its motion does not matter.
         setup: Its setup, linear.
         plane: The hidden plane, about the middle of the setup's.
-        evidence: Of frames, an image each; of events, and of both, one every tenth of a second, or as many as
-            frames where these are more frequent.
+        evidence: Frames tell an image each; events one every tenth of a second, or as many as frames.
         pattern: Fixed pattern of the frame camera, to be taken off.
         columns: Columns to which frames are reduced, pixels.
         static: Standard deviation of a pixel's constant offset over that of its noise; None: as the frames say.
         progress: Told the iterations.
+        maps: Measured thresholds of the event camera; None: they are not known.
 
     Raises:
         ConfigError: The event model states no law of its crossings.
-        DataError: Too few frames, or too many images.
+        DataError: Too few frames, or too many images, or maps of another camera.
     """
     return FilmSolver(setup, plane, columns).film(
         np.asarray(capture.frame_times_us * 1e-6, np.float64),
@@ -595,4 +596,5 @@ def estimate_film_of(
         pattern=pattern,
         static=static,
         progress=progress,
+        maps=used_maps(maps, capture.info, capture.events.shape),
     )

@@ -14,6 +14,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from evnlos.cameras import PixelMaps, load_pixel, load_pixel_maps
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.scene import Glyphs
@@ -182,6 +183,23 @@ def linear_setup(word: str | Path) -> Setup:
             f"{' or '.join(linear_kinds())}"
         )
     return setup
+
+
+def measured_setup(word: str | Path, pixel: str | None = None) -> tuple[Setup, PixelMaps | None]:
+    """Return a linear setup, and what was measured of each pixel of its event camera, if anything was.
+
+    Args:
+        word: As `load_setup` takes it; measured thresholds lie in its folder.
+        pixel: The event pixel instead of the setup's, as `load_pixel` takes it; they lie beside its file.
+
+    Raises:
+        ConfigError: As of `linear_setup`, or of `load_pixel`.
+        DataError: The file of the thresholds is damaged.
+    """
+    setup = linear_setup(word)
+    if pixel is None:
+        return setup, load_pixel_maps(word)
+    return replace(setup, pixel=load_pixel(pixel)), load_pixel_maps(pixel)
 
 
 class NamedSetup(NamedTuple):

@@ -1,6 +1,7 @@
 """Arrays of pixels: thresholds, tiles and threads; the state of the continuous and of the frame-stepped pixel.
 
 - What both pixel arrays share: thresholds per pixel, tiles, threads.
+- The file of a sensor's measured thresholds.
 - The array of continuous-time pixels: state, constants and noise processes of `mode="exact"`.
 - The array of frame-stepped pixels: state, constants and noise processes of `mode="v2e"`.
 """
@@ -13,13 +14,14 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.cameras.event_model import MIN_THRESHOLD, EventModel
+from evnlos.cameras.event_model import MIN_THRESHOLD, EventModel, PixelMaps
 from evnlos.cameras.pixel import EventPixel, V2ePixel
 from evnlos.cameras.pixels import continuous, continuous_math, v2e
 from evnlos.cameras.pixels.continuous import DIM_MAX
@@ -38,11 +40,14 @@ from evnlos.cameras.random_numbers import (
     uniform_field,
 )
 from evnlos.cameras.streams import Columns, Light, check_threshold_maps, expand, joined, sort_events, sort_times
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, DataError
 from evnlos.machine import cores
+from evnlos.untrusted import NUMPY_ERRORS, check_memory, open_regular
 
 _T = TypeVar("_T")
 _SHARES = 8
+PIXEL_MAPS_FILE = "pixel_maps.npz"
+"""Name of the file of a sensor's thresholds, beside its pixel.yaml and in a calibrated setup's folder."""
 
 
 class ContrastSettings(Protocol):
@@ -72,22 +77,59 @@ class ContrastSettings(Protocol):
 def pixel_thresholds(
     pixel: ContrastSettings, shape: tuple[int, int], seed: int, thresholds: object
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return each pixel's thresholds (on, off), float64 [H * W], log units: given, or drawn and clamped."""
-    if thresholds is not None:
+    """Return each pixel's thresholds (on, off), float64 [H * W], log units: given, or drawn and clamped.
+
+    Of measured ones what is not known is drawn: mean + error n, as without any it is threshold + mismatch n.
+    """
+    count = shape[0] * shape[1]
+    if isinstance(thresholds, PixelMaps):
+        check_threshold_maps((thresholds.on, thresholds.off), shape)
+        law = (
+            (thresholds.on.ravel(), thresholds.error_on.ravel()),
+            (thresholds.off.ravel(), thresholds.error_off.ravel()),
+        )
+    elif thresholds is not None:
         on, off = check_threshold_maps(thresholds, shape)
         return on.ravel(), off.ravel()
-    count = shape[0] * shape[1]
+    else:
+        law = (pixel.threshold_on, pixel.threshold_sigma), (pixel.threshold_off, pixel.threshold_sigma)
     drawn = []
-    for nominal, stream in (
-        (pixel.threshold_on, STREAM_THRESHOLD_ON),
-        (pixel.threshold_off, STREAM_THRESHOLD_OFF),
-    ):
-        field = np.full(count, float(nominal))
-        if pixel.threshold_sigma > 0:
-            field += pixel.threshold_sigma * normal_field(pattern_key(pixel, seed), stream, count)
+    for (mean, deviation), stream in zip(law, (STREAM_THRESHOLD_ON, STREAM_THRESHOLD_OFF), strict=True):
+        field = np.full(count, mean, np.float64)
+        if np.any(deviation):
+            field += deviation * normal_field(pattern_key(pixel, seed), stream, count)
             np.maximum(field, MIN_THRESHOLD, out=field)
         drawn.append(field)
     return drawn[0], drawn[1]
+
+
+def load_pixel_maps(word: str | Path) -> PixelMaps | None:
+    """Return what was measured of each pixel of the sensor that a word stands for; None where nothing was.
+
+    Args:
+        word: A pixel's YAML file, as `--pixel` takes it, or a setup's, or the folder of either: the maps lie
+            beside it, in `pixel_maps.npz`. The name of a preset stands for no sensor.
+
+    Raises:
+        DataError: The file of the maps is damaged, or holds something else.
+    """
+    folder = Path(word) if Path(word).is_dir() else Path(word).parent
+    path = folder / PIXEL_MAPS_FILE
+    if not (Path(word).is_dir() or Path(word).suffix in (".yaml", ".yml")) or not path.is_file():
+        return None
+    try:
+        with open_regular(path) as opened, np.load(opened, allow_pickle=False) as file:
+            sizes = [info.file_size for info in file.zip.infolist()]
+            check_memory(2 * sum(sizes), f"{path}", "give that of a smaller sensor")
+            numbers = [file[f"{kind}_{sign}"] for kind in ("threshold", "error") for sign in ("on", "off")]
+            numbers, hot = [np.asarray(one, np.float64) for one in numbers], np.asarray(file["hot"], np.bool_)
+        check_threshold_maps((numbers[0], numbers[1]), hot.shape)
+        if hot.ndim != 2 or not all(one.shape == hot.shape and (one >= 0).all() for one in numbers):
+            raise ValueError("its maps are not of one size, or negative")
+    except (ConfigError, *NUMPY_ERRORS) as error:
+        raise DataError(f"{path} holds no thresholds of a sensor: {' '.join(str(error).split())}") from None
+    on, off, error_on, error_off = numbers
+    return PixelMaps(on, off, error_on, error_off, hot)
 
 
 def pattern_key(pixel: ContrastSettings, seed: int) -> np.uint64:
