@@ -29,6 +29,7 @@ from evnlos.calibration import (
     value_of,
     waveform,
 )
+from evnlos.calibration.pixel_statistics import Surface
 from evnlos.cameras import BrownianPixel, EventPixel, PixelSettings, load_pixel, simulate_events
 from evnlos.cli import main
 from evnlos.cli.main import command_of
@@ -75,6 +76,23 @@ def test_simulated_truth_comes_back_within_its_intervals(name: str) -> None:
         assert fit.pixel.threshold_on == pytest.approx(truth.threshold_on, rel=0.05)
         assert fit.pixel.threshold_off == pytest.approx(truth.threshold_off, rel=0.05)
     assert missed <= 3
+
+
+def test_a_place_beside_the_likeliest_is_told_by_how_far_simulations_scatter() -> None:
+    """Of twenty numbers that say little more than three do, a wrong place misses by far less than twenty."""
+    draw = np.random.default_rng(3)
+    slope, mixing = draw.standard_normal((3, 20)), draw.standard_normal((12, 20))
+    error = 0.01 * mixing.T @ mixing + 1e-4 * np.eye(20)
+    stated = error + 0.05 * np.diag(np.diag(error))  # as a floor under what scatters makes it
+    root = np.linalg.cholesky(error)
+    design = 0.1 * draw.standard_normal((120, 3))
+    made = design @ slope + draw.standard_normal((120, 20)) @ root.T
+    surface = Surface.fitted(design, made, np.zeros(3), 0.1**2 * np.eye(3))
+    recorded, aside = draw.standard_normal((12, 20)) @ root.T, 0.3 * draw.standard_normal((12, 20))
+    right = [surface.posterior(one, stated, draw)[1] for one in recorded]
+    wrong = [surface.posterior(one, stated, draw)[1] for one in recorded + aside]  # what no number explains
+    assert np.median(right) < 1 and max(right) < 2
+    assert min(wrong) > 1
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,6 @@ _LEAST = (0.3, 0.12, 0.05, 0.02, 0.008, 0.004)  # least scatter of the last roun
 _SHARED = 1.6  # standard deviations of the last simulations within which earlier ones are used again
 _NARROWED = 1.7  # mean ratio of their standard deviations to those asked for, above which another round follows
 _MAY_BE_NONE = (MISMATCH, "leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_dn_hz")
-_STUCK = 0.6  # misfit at which an attempt may have ended beside the likeliest place
 _ATTEMPTS = 3
 _REPLICATES = 4
 _WIDER = 1.6  # errors of v2e's pixel over those of the posterior, of these (benchmarks/pixel_fit_coverage.py)
@@ -268,10 +267,11 @@ def fit_candidate(
         start = replace(start, refractory_s=refractory_s)  # type: ignore[type-var]
     search = _Search(name, panels, settings, start, free, progress)
     found = [search.attempt(0)]
-    while found[-1][1] > _STUCK and len(found) < _ATTEMPTS:
+    while found[-1][1] > 1.0 and len(found) < _ATTEMPTS:  # it may have ended beside the likeliest place
         found.append(search.attempt(len(found)))
-    draws, _ = min(found, key=lambda one: one[1])
-    misfit = search.misfit(draws.mean(axis=0))
+    # Which is nearest is told by simulations there: the polynomial of a poor place is poor, and excuses more.
+    misfits = [search.misfit(draws.mean(axis=0)) for draws, _ in found]
+    misfit, draws = min(misfits), found[int(np.argmin(misfits))][0]
     wide = [_WIDER if isinstance(start, EventPixel) and one.name in _WIDENED else 1.0 for one in free]
     estimates = tuple(_estimate(one, draws[:, k], wide[k]) for k, one in enumerate(free))
     pixel = pixel_at(start, free, np.median(draws, axis=0))
@@ -314,7 +314,11 @@ class _Search:
         return np.stack(found)
 
     def attempt(self, number: int) -> tuple[Array, float]:
-        """Return posterior draws [S, P], and the misfit of the likeliest."""
+        """Return posterior draws [S, P], and how far the recording is from the polynomial at the likeliest.
+
+        That distance is counted in those of the simulations. At the right place it is below 1: the recording is
+        one more such draw, and the free numbers were fitted to it.
+        """
         panels, settings, target, size = self._panels, self._settings, self._target, self._size
         draw = np.random.default_rng(derive_seed(self._seed, "attempt", number))
         self._total += len(_FLOORS) * settings.ensemble + len(_LEAST) * settings.simulations
@@ -325,7 +329,7 @@ class _Search:
             error = own + floor**2 * np.eye(len(target))
             ensemble = updated(ensemble, self._means(ensemble), target, error, draw)
         centre, spread = ensemble.mean(axis=0), np.cov(ensemble.T) + 0.05**2 * np.eye(size)
-        draws, miss = ensemble, math.inf
+        draws, distance = ensemble, math.inf
         tried, seen = np.zeros((0, size)), np.zeros((0, len(target)))
         for least in _LEAST:
             scatter = clipped(NEAR**2 * spread, least, 0.7)
@@ -335,7 +339,7 @@ class _Search:
             away = np.linalg.solve(root, (tried - centre).T)
             near = (away**2).sum(axis=0) < _SHARED**2 * size  # those of earlier rounds, too
             covariance = _covariance(panels, self._pixel(centre), self._seed)[0]
-            draws, miss = Surface.fitted(tried[near], seen[near], centre, scatter).posterior(
+            draws, distance = Surface.fitted(tried[near], seen[near], centre, scatter).posterior(
                 target, covariance, draw
             )
             before, centre, spread = centre, draws.mean(axis=0), np.cov(draws.T)
@@ -344,7 +348,7 @@ class _Search:
             if shift < 0.5 * size and narrowed < 2.0 * size * math.log(_NARROWED):
                 break
         self._progress(Step(f"fit {self._name}", self._total, self._total, "simulations"))
-        return draws, miss
+        return draws, distance
 
     def misfit(self, u: Array) -> float:
         """Return the mean squared distance of the statistics from simulations at u, in standard errors."""
