@@ -53,6 +53,7 @@ _SHARED = 1.6  # standard deviations of the last simulations within which earlie
 _NARROWED = 1.7  # mean ratio of their standard deviations to those asked for, above which another round follows
 _MAY_BE_NONE = (MISMATCH, "leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_dn_hz")
 _ATTEMPTS = 3
+_AT_END = 0.05  # share of the searched range at whose ends the range decides, not the recording
 _REPLICATES = 4
 _WIDER = 1.6  # errors of v2e's pixel over those of the posterior, of these (benchmarks/pixel_fit_coverage.py)
 _WIDENED = ("threshold_on", "threshold_off", "leak_rate_hz", "shot_noise_rate_hz")
@@ -135,7 +136,7 @@ class Estimate:
         low: Its 2.5 % quantile.
         high: Its 97.5 % quantile.
         state: "identified", "at most" (not told from none; `high` bounds it) or "not identified": the interval
-            is more than half as wide as the range in which it was looked for.
+            is more than half as wide as the range in which it was looked for, or ends at an end of that.
     """
 
     name: str
@@ -281,7 +282,8 @@ def fit_candidate(
     pixel = replace(pixel, initial_phase="random")  # type: ignore[type-var]  # as all that it is compared with
     on, off, ratio = (value_of(one, draws[:, k]) for k, one in enumerate(free[:3]))
     low, middle, high = (float(q) for q in np.quantile(ratio * 0.5 * (on + off), (0.025, 0.5, 0.975)))
-    estimates += (Estimate("threshold_sigma", middle, low, high, estimates[2].state),)
+    state = next((one.state for one in estimates[:2] if one.state != "identified"), estimates[2].state)
+    estimates += (Estimate("threshold_sigma", middle, low, high, state),)
     return CandidateFit(name, pixel, start, free, draws, estimates, misfit, np.asarray(np.corrcoef(draws.T)))
 
 
@@ -385,9 +387,10 @@ def _estimate(free: Free, draws: Array, wider: float = 1.0) -> Estimate:
     low, high = middle - wider * (middle - low), middle + wider * (high - middle)
     shares = [NormalDist().cdf(float(u)) for u in (low, high)]
     state = "identified"
-    if shares[1] - shares[0] > 0.5:
+    at_low, at_high = shares[0] < _AT_END, shares[1] > 1.0 - _AT_END
+    if shares[1] - shares[0] > 0.5 or at_high or (at_low and free.name not in _MAY_BE_NONE):
         state = "not identified"
-    elif shares[0] < 0.05 and free.name in _MAY_BE_NONE:
+    elif at_low:
         state = "at most"
     value, least, most = (float(value_of(free, u)) for u in (middle, low, high))
     return Estimate(free.name, value, least, most, state)
