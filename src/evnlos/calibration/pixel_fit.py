@@ -267,12 +267,14 @@ def fit_candidate(
     if hasattr(start, "refractory_s"):
         start = replace(start, refractory_s=refractory_s)  # type: ignore[type-var]
     search = _Search(name, panels, settings, start, free, progress)
-    found = [search.attempt(0)]
-    while found[-1][1] > 1.0 and len(found) < _ATTEMPTS:  # it may have ended beside the likeliest place
-        found.append(search.attempt(len(found)))
-    # Which is nearest is told by simulations there: the polynomial of a poor place is poor, and excuses more.
-    misfits = [search.misfit(draws.mean(axis=0)) for draws, _ in found]
-    misfit, draws = min(misfits), found[int(np.argmin(misfits))][0]
+    found: list[tuple[float, Array]] = []
+    while len(found) < _ATTEMPTS:
+        draws, distance = search.attempt(len(found))
+        # Simulations there judge, too: the polynomial of a poor place is poor, and excuses more.
+        found.append((search.misfit(draws.mean(axis=0)), draws))
+        if distance <= 1.0 and found[-1][0] <= 1.0:  # else it may have ended beside the likeliest place
+            break
+    misfit, draws = min(found, key=lambda one: one[0])
     wide = [_WIDER if isinstance(start, EventPixel) and one.name in _WIDENED else 1.0 for one in free]
     estimates = tuple(_estimate(one, draws[:, k], wide[k]) for k, one in enumerate(free))
     pixel = pixel_at(start, free, np.median(draws, axis=0))
