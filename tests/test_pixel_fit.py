@@ -16,6 +16,7 @@ from evnlos.calibration import (
     LitRecording,
     Manifest,
     PixelFitSettings,
+    Surface,
     doubts_of,
     fit_candidate,
     fit_known_light,
@@ -29,7 +30,6 @@ from evnlos.calibration import (
     value_of,
     waveform,
 )
-from evnlos.calibration.pixel_statistics import Surface
 from evnlos.cameras import BrownianPixel, EventPixel, PixelSettings, load_pixel, simulate_events
 from evnlos.cli import main
 from evnlos.cli.main import command_of
