@@ -52,9 +52,9 @@ LIGHTS = (
 )
 
 
-def one_draw(name: str, number: int) -> dict:
-    """Return truth and intervals of a draw."""
-    seed = derive_seed(20261123, name, number)
+def one_draw(name: str, number: int, root: int) -> dict:
+    """Return truth and intervals of a draw; root: seed of all draws."""
+    seed = derive_seed(root, name, number)
     draw = np.random.default_rng(seed)
     ranges = SHARED | TRUTHS[name]
     truth = {key: math.exp(draw.uniform(math.log(low), math.log(high))) for key, (low, high) in ranges.items()}
@@ -104,6 +104,9 @@ def table(lines: list[dict]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=40)
+    parser.add_argument(
+        "--seed", type=int, default=20261123, help="of all draws; another has a file of its own"
+    )
     parser.add_argument("--models", nargs="+", default=list(TRUTHS))
     parser.add_argument("--out", type=Path, default=Path("pixel_fit_coverage.jsonl"))
     options = parser.parse_args()
@@ -113,7 +116,7 @@ def main() -> None:
         for name in options.models:
             if (name, number) in done:
                 continue
-            lines.append(one_draw(name, number))
+            lines.append(one_draw(name, number, options.seed))
             with options.out.open("a") as file:
                 file.write(json.dumps(lines[-1]) + "\n")
     print(table(lines))

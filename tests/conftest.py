@@ -72,6 +72,7 @@ THOROUGH = (
     "test_faults.py::test_workers_end_with_their_parent[9-False-at work]",
     "test_faults.py::test_workers_end_with_their_parent[9-False-starting]",
     "test_mitsuba_oracle.py::test_two_per_cent_of_gain_are_found[GGX 0.3, post]",
+    "test_pixel_fit.py::test_many_pixels_of_real_recordings_embarrass_nobody",
     "test_tracking.py::test_approach_and_retreat_are_found[0.0]",
     "test_tracking.py::test_the_page_on_motion_says_what_the_command_prints[near_G]",
 )

@@ -17,6 +17,7 @@ from evnlos.calibration import (
     LitRecording,
     Manifest,
     PixelFitSettings,
+    Surface,
     doubts_of,
     fit_candidate,
     fit_known_light,
@@ -87,6 +88,23 @@ def test_simulated_truth_comes_back_within_its_intervals(name: str) -> None:
         assert fit.pixel.threshold_on == pytest.approx(truth.threshold_on, rel=0.05)
         assert fit.pixel.threshold_off == pytest.approx(truth.threshold_off, rel=0.05)
     assert missed <= 3
+
+
+def test_a_place_beside_the_likeliest_is_told_by_how_far_simulations_scatter() -> None:
+    """Of twenty numbers that say little more than three do, a wrong place misses by far less than twenty."""
+    draw = np.random.default_rng(3)
+    slope, mixing = draw.standard_normal((3, 20)), draw.standard_normal((12, 20))
+    error = 0.01 * mixing.T @ mixing + 1e-4 * np.eye(20)
+    stated = error + 0.05 * np.diag(np.diag(error))  # as a floor under what scatters makes it
+    root = np.linalg.cholesky(error)
+    design = 0.1 * draw.standard_normal((120, 3))
+    made = design @ slope + draw.standard_normal((120, 20)) @ root.T
+    surface = Surface.fitted(design, made, np.zeros(3), 0.1**2 * np.eye(3))
+    recorded, aside = draw.standard_normal((12, 20)) @ root.T, 0.3 * draw.standard_normal((12, 20))
+    right = [surface.posterior(one, stated, draw)[1] for one in recorded]
+    wrong = [surface.posterior(one, stated, draw)[1] for one in recorded + aside]  # what no number explains
+    assert np.median(right) < 1 and max(right) < 2
+    assert min(wrong) > 1
 
 
 @pytest.fixture(scope="module")
@@ -368,6 +386,89 @@ def test_real_recordings_without_known_light(shared_data, name: str) -> None:
     found = fit_known_light(Manifest((LitFile(str(path)),)), QUICK)
     assert found.pixel is None and found.refractory.state != "identified"
     assert not any("flicker" in line for line in found.warnings)
+
+
+RECORDINGS = (
+    "aedat2_davis346.aedat", "aedat31_davis346.aedat", "ecf_evt3_sample.h5", "ecf_gaps.h5", "ecf_masks.h5",
+    "ecf_partial.h5", "ecf_random.h5", "ecf_rows.h5", "expelliarmus_evt2_sample.raw",
+    "expelliarmus_evt3_sample.raw", "faery_dvs.es", "faery_evt2.raw", "ros1_evt3_640x480.bag",
+    "ros2_evt3_640x480.db3", "ros2_evt3_zstd.mcap", "ros2_libcaer_cmp_346x260.mcap",
+    "ros2_libcaer_dvxplorer.db3",
+)  # fmt: skip
+PHYSICS = {
+    "threshold_on": (0.01, 2.0), "threshold_off": (0.01, 2.0), "threshold_sigma": (0.0, 1.0),
+    MISMATCH: (0.0, 1.0), "refractory_s": (0.0, 1.0), "cutoff_hz": (0.1, 1e5), "leak_rate_hz": (0.0, 100.0),
+    "shot_noise_rate_hz": (0.0, 1e3),
+}  # fmt: skip
+"""Between what a number of an event pixel lies: log units, shares of a threshold, s, Hz."""
+
+
+def fitted_without_embarrassment(path, light: tuple[str, ...], out, capsys, pixels: str) -> bool:
+    """Return whether a recording was fitted: else it was refused in one line; what is said holds water."""
+    if not path.is_file():
+        pytest.skip(f"no {path.name}")
+    words = [
+        "--models",
+        "continuous",
+        "--pixels",
+        pixels,
+        "--ensemble",
+        "12",
+        "--simulations",
+        "30",
+        "--checks",
+        "10",
+    ]
+    try:
+        main(["pixel", "fit", str(path), "--light", *light, "--out", str(out), *words])
+        code = 0
+    except SystemExit as stop:
+        code = stop.code
+    said = capsys.readouterr().err
+    if code == 2:
+        assert not out.exists()
+        lines = [line for line in said.splitlines() if not line.startswith(("read:", "fit "))]
+        assert len(lines) == 1 and " error: " in lines[0]
+        return False
+    values = json.loads((out / "pixel_fit.json").read_text())
+    assert code == (0 if light == ("unknown",) or values["describes_the_sensor"] else 1)
+    assert (out / "pixel.yaml").exists() == (values["model"] is not None)
+    ranges = {one.name: one for one in CANDIDATES["continuous"][1]}
+    for one in values["estimates"] + [each for found in values["all_estimates"].values() for each in found]:
+        if one["state"] == "not identified":
+            continue
+        least, most = PHYSICS[one["name"]]
+        assert least <= one["low"] <= one["value"] <= one["high"] <= most, one
+        if one["state"] == "identified" and one["name"] in ranges:
+            free = ranges[one["name"]]
+            low, high = (
+                math.log(one[end] / free.low) / math.log(free.high / free.low) for end in ("low", "high")
+            )
+            assert 0.04 < low < high < 0.96, one  # the ends of what was searched say nothing
+    for seen in values["recordings"].values():
+        assert seen["seconds"] > 0 and all(math.isfinite(value) for value in seen.values())
+    return True
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_real_recording_embarrasses_nobody(shared_data, name: str, tmp_path, capsys) -> None:
+    """Whatever light is stated: unknown, its own frames, or a constant one that it did not have."""
+    path = shared_data / "recordings" / name
+    assert fitted_without_embarrassment(path, ("unknown",), tmp_path / "unknown", capsys, "48")
+    assert not fitted_without_embarrassment(path, ("frames",), tmp_path / "frames", capsys, "48")
+    if name != "faery_dvs.es":  # of which a test above fits it
+        fitted_without_embarrassment(path, ("static", "60"), tmp_path / "static", capsys, "48")
+
+
+def test_many_pixels_of_real_recordings_embarrass_nobody(shared_data, tmp_path, capsys) -> None:
+    fitted = [
+        name
+        for name in RECORDINGS
+        if fitted_without_embarrassment(
+            shared_data / "recordings" / name, ("static", "60"), tmp_path / name, capsys, "480"
+        )
+    ]
+    assert len(fitted) > 4
 
 
 def test_the_scatter_of_pixels_knows_that_they_share_a_phase() -> None:

@@ -37,6 +37,7 @@ from .pixel_light import LitRecording as LitRecording
 from .pixel_light import waveform as waveform
 from .pixel_report import KnownLightFit as KnownLightFit
 from .pixel_report import fit_known_light as fit_known_light
+from .pixel_statistics import Surface as Surface
 from .pixel_statistics import simulated_events as simulated_events
 from .summary import CALIBRATION_VALUES_FILE as CALIBRATION_VALUES_FILE
 from .summary import calibrate as calibrate

@@ -26,6 +26,7 @@ _DRAWS = 12  # posterior draws whose simulations stand for a model
 _RESAMPLES = 200
 _UNLIKELY = 0.01
 _FEWEST_PAIRS = 30  # intervals that are all alike before they count as the refractory period
+_LONGEST_S = 1.0  # refractory period, above those of all sensors: longer intervals bound nothing
 _FINE_TICKS = 5  # ticks of the time stamps that a refractory period must last to be told from them
 _PILE = 5.0  # times as many intervals at the shortest as just above it
 _TEETH, _PARTS = 6, 8  # how far a comb is followed, and in how many parts of the shortest interval
@@ -114,13 +115,14 @@ def refractory_of(events: Sequence[Events]) -> Estimate:
 
     A pixel whose light has moved by more than a threshold while it was blind sends its next event at the end of
     the refractory period, so many intervals are alike. Where they do not, only a bound is known. So it is where
-    they pile up again at multiples of it, or of a part of it: so often is that sensor read.
+    they pile up again at multiples of it, or of a part of it: so often is that sensor read. Where even the
+    shortest are longer than a second, nothing is known.
 
     Args:
         events: Recordings of one sensor.
     """
     shortest, tick_us = shortest_interval_s(events), max(tick_of(one) for one in events)
-    if not math.isfinite(shortest):
+    if shortest > _LONGEST_S:
         return Estimate("refractory_s", 0.0, 0.0, math.inf, "not identified")
     every = np.concatenate([intervals(*by_pixel(one))[1] for one in events]).astype(np.float64)
     base = shortest * 1e6

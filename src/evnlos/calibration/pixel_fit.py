@@ -52,8 +52,8 @@ _LEAST = (0.3, 0.12, 0.05, 0.02, 0.008, 0.004)  # least scatter of the last roun
 _SHARED = 1.6  # standard deviations of the last simulations within which earlier ones are used again
 _NARROWED = 1.7  # mean ratio of their standard deviations to those asked for, above which another round follows
 _MAY_BE_NONE = (MISMATCH, "leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_dn_hz")
-_STUCK = 0.6  # misfit at which an attempt may have ended beside the likeliest place
 _ATTEMPTS = 3
+_AT_END = 0.05  # share of the searched range at whose ends the range decides, not the recording
 _REPLICATES = 4
 _WIDER = 1.6  # errors of v2e's pixel over those of the posterior, of these (benchmarks/pixel_fit_coverage.py)
 _WIDENED = ("threshold_on", "threshold_off", "leak_rate_hz", "shot_noise_rate_hz")
@@ -136,7 +136,7 @@ class Estimate:
         low: Its 2.5 % quantile.
         high: Its 97.5 % quantile.
         state: "identified", "at most" (not told from none; `high` bounds it) or "not identified": the interval
-            is more than half as wide as the range in which it was looked for.
+            is more than half as wide as the range in which it was looked for, or ends at an end of that.
     """
 
     name: str
@@ -267,11 +267,14 @@ def fit_candidate(
     if hasattr(start, "refractory_s"):
         start = replace(start, refractory_s=refractory_s)  # type: ignore[type-var]
     search = _Search(name, panels, settings, start, free, progress)
-    found = [search.attempt(0)]
-    while found[-1][1] > _STUCK and len(found) < _ATTEMPTS:
-        found.append(search.attempt(len(found)))
-    draws, _ = min(found, key=lambda one: one[1])
-    misfit = search.misfit(draws.mean(axis=0))
+    found: list[tuple[float, Array]] = []
+    while len(found) < _ATTEMPTS:
+        draws, distance = search.attempt(len(found))
+        # Simulations there judge, too: the polynomial of a poor place is poor, and excuses more.
+        found.append((search.misfit(draws.mean(axis=0)), draws))
+        if distance <= 1.0 and found[-1][0] <= 1.0:  # else it may have ended beside the likeliest place
+            break
+    misfit, draws = min(found, key=lambda one: one[0])
     wide = [_WIDER if isinstance(start, EventPixel) and one.name in _WIDENED else 1.0 for one in free]
     estimates = tuple(_estimate(one, draws[:, k], wide[k]) for k, one in enumerate(free))
     pixel = pixel_at(start, free, np.median(draws, axis=0))
@@ -281,7 +284,8 @@ def fit_candidate(
     pixel = replace(pixel, initial_phase="random")  # type: ignore[type-var]  # as all that it is compared with
     on, off, ratio = (value_of(one, draws[:, k]) for k, one in enumerate(free[:3]))
     low, middle, high = (float(q) for q in np.quantile(ratio * 0.5 * (on + off), (0.025, 0.5, 0.975)))
-    estimates += (Estimate("threshold_sigma", middle, low, high, estimates[2].state),)
+    state = next((one.state for one in estimates[:2] if one.state != "identified"), estimates[2].state)
+    estimates += (Estimate("threshold_sigma", middle, low, high, state),)
     return CandidateFit(name, pixel, start, free, draws, estimates, misfit, np.asarray(np.corrcoef(draws.T)))
 
 
@@ -314,7 +318,11 @@ class _Search:
         return np.stack(found)
 
     def attempt(self, number: int) -> tuple[Array, float]:
-        """Return posterior draws [S, P], and the misfit of the likeliest."""
+        """Return posterior draws [S, P], and how far the recording is from the polynomial at the likeliest.
+
+        That distance is counted in those of the simulations. At the right place it is below 1: the recording is
+        one more such draw, and the free numbers were fitted to it.
+        """
         panels, settings, target, size = self._panels, self._settings, self._target, self._size
         draw = np.random.default_rng(derive_seed(self._seed, "attempt", number))
         self._total += len(_FLOORS) * settings.ensemble + len(_LEAST) * settings.simulations
@@ -325,7 +333,7 @@ class _Search:
             error = own + floor**2 * np.eye(len(target))
             ensemble = updated(ensemble, self._means(ensemble), target, error, draw)
         centre, spread = ensemble.mean(axis=0), np.cov(ensemble.T) + 0.05**2 * np.eye(size)
-        draws, miss = ensemble, math.inf
+        draws, distance = ensemble, math.inf
         tried, seen = np.zeros((0, size)), np.zeros((0, len(target)))
         for least in _LEAST:
             scatter = clipped(NEAR**2 * spread, least, 0.7)
@@ -335,7 +343,7 @@ class _Search:
             away = np.linalg.solve(root, (tried - centre).T)
             near = (away**2).sum(axis=0) < _SHARED**2 * size  # those of earlier rounds, too
             covariance = _covariance(panels, self._pixel(centre), self._seed)[0]
-            draws, miss = Surface.fitted(tried[near], seen[near], centre, scatter).posterior(
+            draws, distance = Surface.fitted(tried[near], seen[near], centre, scatter).posterior(
                 target, covariance, draw
             )
             before, centre, spread = centre, draws.mean(axis=0), np.cov(draws.T)
@@ -344,7 +352,7 @@ class _Search:
             if shift < 0.5 * size and narrowed < 2.0 * size * math.log(_NARROWED):
                 break
         self._progress(Step(f"fit {self._name}", self._total, self._total, "simulations"))
-        return draws, miss
+        return draws, distance
 
     def misfit(self, u: Array) -> float:
         """Return the mean squared distance of the statistics from simulations at u, in standard errors."""
@@ -381,9 +389,10 @@ def _estimate(free: Free, draws: Array, wider: float = 1.0) -> Estimate:
     low, high = middle - wider * (middle - low), middle + wider * (high - middle)
     shares = [NormalDist().cdf(float(u)) for u in (low, high)]
     state = "identified"
-    if shares[1] - shares[0] > 0.5:
+    at_low, at_high = shares[0] < _AT_END, shares[1] > 1.0 - _AT_END
+    if shares[1] - shares[0] > 0.5 or at_high or (at_low and free.name not in _MAY_BE_NONE):
         state = "not identified"
-    elif shares[0] < 0.05 and free.name in _MAY_BE_NONE:
+    elif at_low:
         state = "at most"
     value, least, most = (float(value_of(free, u)) for u in (middle, low, high))
     return Estimate(free.name, value, least, most, state)

@@ -291,7 +291,11 @@ class Surface:
         return cls(centre, root, terms, bare.shape[1] / len(design), residual)
 
     def posterior(self, target: Array, covariance: Array, draw: np.random.Generator) -> tuple[Array, float]:
-        """Return posterior draws [S, P], and the misfit: squared distance over its degrees of freedom."""
+        """Return posterior draws [S, P], and the target's squared distance over the simulations' mean one.
+
+        Statistics depend on each other so much that a distance of K of them has far fewer degrees of freedom;
+        how far simulations lie from the polynomial tells what a matching recording has.
+        """
         # What the polynomial misses counts as noise of each statistic: on the safe side, as many are alike.
         missed = np.maximum(np.diag(self.residual) - np.diag(covariance), 0.0)
         error = (covariance + np.diag(missed)) * (1.0 + self.error)
@@ -313,8 +317,8 @@ class Surface:
             return -0.5 * distance / widening - 0.5 * (u**2).sum(axis=1) - 1e3 * outside
 
         best, slope = self._best(miss_of, score)
-        misfit = float((miss_of(best[None]) ** 2).sum()) / freedom
-        widening = max(1.0, misfit)
+        distance = float((miss_of(best[None]) ** 2).sum())
+        widening = max(1.0, distance / freedom)
         step = np.linalg.cholesky(np.linalg.inv(slope.T @ slope / widening + np.eye(size)))
         at = best + draw.standard_normal((_CHAINS, size)) @ step.T
         kept: list[Array] = []
@@ -331,7 +335,9 @@ class Surface:
             every = np.concatenate(kept)
             step = np.linalg.cholesky(np.cov(every.T) + 1e-10 * np.eye(size))
         every = np.concatenate(kept)
-        return every[:: max(1, len(every) // _KEPT)], misfit
+        return every[:: max(1, len(every) // _KEPT)], distance / float(
+            np.trace(white.T @ self.residual @ white)
+        )
 
     def _best(
         self, miss_of: Callable[[Array], Array], score: Callable[[Array, float], Array]
