@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import ClassVar, Literal
 
 import torch
@@ -208,13 +209,8 @@ class PaperSetup(Setup):
         }
 
     def _kernel(self, pitch_m: float) -> torch.Tensor:
-        return tpsf_kernel(
-            pitch_m,
-            self.tpsf_length_m,
-            t=self.tpsf_t,
-            mean_free_path=self.mean_free_path,
-            kernel_radius=self.kernel_radius,
-            window=self.window,
+        return _tpsf(
+            pitch_m, self.tpsf_length_m, self.tpsf_t, self.mean_free_path, self.kernel_radius, self.window
         )
 
     @property
@@ -225,6 +221,15 @@ class PaperSetup(Setup):
         return Diffraction(
             plane, self.wavelength_m, self.distance_m, self.field_step_m, self.field, self.result
         )
+
+
+@lru_cache(maxsize=2)  # a fit asks for each capture's, and they share it
+def _tpsf(
+    pitch_m: float, length_m: float, t: float, mean_free_path: float, radius: float, window: float
+) -> torch.Tensor:
+    return tpsf_kernel(
+        pitch_m, length_m, t=t, mean_free_path=mean_free_path, kernel_radius=radius, window=window
+    )
 
 
 class _LinearPart(LinearTransport):
