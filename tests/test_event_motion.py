@@ -95,7 +95,7 @@ def test_a_capture_of_constant_distance_is_not_identified(shared_data) -> None:
 
 def test_what_a_pose_changes_of_the_light_is_its_derivative() -> None:
     """Slow reference: the light of the same target at poses on both sides."""
-    times, reach = np.linspace(*SPAN_S, 9), np.array([[-0.16, -0.12], [0.16, 0.12]])
+    times, reach = np.linspace(*SPAN_S, 9), np.array([[-0.1, -0.06], [0.1, 0.06]])
     fit = EventFit(SETUP, reach, times, (16, 24), (16, 24), 0.1, 12, depth=True, turning=True)
     path = fit.start(BENT.position_m(times))
     rng = np.random.default_rng(2)
