@@ -11,6 +11,7 @@ import torch
 
 from evnlos.cameras import EventPixel
 from evnlos.errors import ConfigError
+from evnlos.machine import note
 from evnlos.optics import (
     Diffraction,
     DiffuseReflection,
@@ -238,13 +239,28 @@ class _LinearPart(LinearTransport):
     def __init__(
         self, plane: Plane, fine: int, reflection: DiffuseReflection, view: ViewOperator, gain: float
     ) -> None:
-        self.source = plane
+        self.source = self._plane = plane
         self._fine, self._gain = fine, gain
         self._reflection, self._view = reflection, view
 
     @property
     def shape(self) -> tuple[int, int]:
         return self._view.shape
+
+    def dense(self, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+        """Return the matrix, [H W, h w]: what a cell reflects is the same everywhere, only shifted."""
+        (height, width), side = self._plane.shape, self._fine
+        one = Plane(side, side, self._plane.pitch_m / side)
+        spot = DiffuseReflection(one, self._reflection.kernel)(torch.ones(one.shape, dtype=dtype))
+        rows = []
+        for row in range(height):
+            note(f"light path, {row * width} of {height * width} cells")
+            wall = torch.zeros(width, *self._reflection.shape, dtype=dtype)
+            for column, lit in enumerate(wall):
+                down, across = row * side, column * side
+                lit[down : down + spot.shape[0], across : across + spot.shape[1]] = spot
+            rows.append(self._gain * self._view(wall).flatten(1).mT)
+        return torch.cat(rows, dim=1)
 
     def _forward(self, scene: torch.Tensor) -> torch.Tensor:
         samples = scene.repeat_interleave(self._fine, -2).repeat_interleave(self._fine, -1)
