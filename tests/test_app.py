@@ -550,14 +550,14 @@ def strangers(addresses: list[str], home: str) -> list[str]:
 
 
 @contextmanager
-def browsed(folder: Path) -> Iterator[tuple[str, chromium.Chromium]]:
-    """Give the address of a page that is served, and a browser."""
+def browsed(folder: Path, *words: str) -> Iterator[tuple[str, chromium.Chromium]]:
+    """Give the address of a page that is served with further words of the command, and a browser."""
     if importlib.util.find_spec("gradio") is None:
         pytest.skip("gradio is not installed: pip install 'evnlos[app]'")
     if chromium.missing():
         pytest.skip(f"{chromium.missing()}: apt-get install chromium chromium-driver")
     with (
-        chromium.page(folder, "--columns", "24", "--upload-mb", "2") as home,
+        chromium.page(folder, "--columns", "24", "--upload-mb", "2", *words) as home,
         chromium.Chromium(folder / "profile") as browser,
     ):
         yield home, browser
@@ -566,8 +566,9 @@ def browsed(folder: Path) -> Iterator[tuple[str, chromium.Chromium]]:
 SEQUENCE_OF = "document.querySelector('.ev-sheet').dataset.sequence"
 
 
-def test_the_page_in_a_real_browser(tmp_path) -> None:
-    with browsed(tmp_path) as (home, browser):
+def test_the_page_in_a_real_browser(app_weights, tmp_path) -> None:
+    """With a small network of its own; on a phone are those of the package."""
+    with browsed(tmp_path, "--weights", str(app_weights["event"])) as (home, browser):
         assert urlsplit(home).hostname == "127.0.0.1"
         with pytest.raises(urllib.error.HTTPError) as stop:
             urllib.request.urlopen(urllib.request.Request(home, headers={"Host": "evil.example"}), timeout=60)

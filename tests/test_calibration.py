@@ -215,7 +215,7 @@ def test_a_fit_that_fails_on_unseen_captures_is_refused(folders, tmp_path, capsy
 def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
     out = tmp_path / "setup"
     words = ["--out", out, "--holdout", "4", "--exclude", "A", "E", "O", "--no-events", "--preset", "paper"]
-    words += ["--start.setup.field-of-view-m", 0.6, "--columns", 24]
+    words += ["--start.setup.field-of-view-m", 0.6, "--start.setup.pitch-m", 0.001, "--columns", 24]
     main(["calibrate", *map(str, folders), *map(str, words)])
     text = capsys.readouterr().out
     assert "held out: lab_4" in text and "lab_E" not in text
@@ -224,7 +224,7 @@ def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
     assert isinstance(setup.setup, PaperSetup)
     found = json.loads((out / "calibration.json").read_text())["residuals"]["frames held out"]
     assert found["after"] < 0.25 < found["before"]
-    start = replace(paper().start, setup=replace(paper().start.setup, field_of_view_m=0.6))
+    start = replace(paper().start, setup=replace(paper().start.setup, field_of_view_m=0.6, pitch_m=0.001))
     settings = Calibration(exclude=("A", "E", "O"), holdout=("4",), events=False, columns=24, start=start)
     looked, steps = [], []
     fit = evnlos.calibrate(folders, tmp_path / "python", settings, look=looked.append, progress=steps.append)

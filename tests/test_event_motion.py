@@ -58,7 +58,8 @@ def test_events_alone_tell_a_bent_path_within_what_they_state() -> None:
 def test_events_alone_tell_distance_and_turn() -> None:
     away, setup = (0.28, 0.3, 0.32, 0.3), replace(SETUP, roughness=0.09)  # behind which fewer distances differ
     scene, events = recorded(replace(BENT, z_m=away, rotation_deg=(-20.0, 5.0, 20.0, -5.0)), setup)
-    track = track_events(events, SPAN_S, setup, Tracking(target_size_m=0.1, depth=True, turning=True))
+    small = Tracking(target_size_m=0.1, depth=True, turning=True, columns=24, cells=12)
+    track = track_events(events, SPAN_S, setup, small)
     pose = scene.pose(track.frame_time_s)
     assert track.distance is not None and track.turn is not None
     assert track.distance.is_identified and track.turn.is_identified
@@ -94,7 +95,7 @@ def test_a_capture_of_constant_distance_is_not_identified(shared_data) -> None:
 
 def test_what_a_pose_changes_of_the_light_is_its_derivative() -> None:
     """Slow reference: the light of the same target at poses on both sides."""
-    times, reach = np.linspace(*SPAN_S, 9), np.array([[-0.16, -0.12], [0.16, 0.12]])
+    times, reach = np.linspace(*SPAN_S, 9), np.array([[-0.1, -0.06], [0.1, 0.06]])
     fit = EventFit(SETUP, reach, times, (16, 24), (16, 24), 0.1, 12, depth=True, turning=True)
     path = fit.start(BENT.position_m(times))
     rng = np.random.default_rng(2)
@@ -145,7 +146,7 @@ def test_what_no_path_can_be_found_from_is_refused() -> None:
     with pytest.raises(
         DataError, match=r"the path explains .* % of what the events say of the light, noise alone"
     ):
-        track_events(noise, SPAN_S, SETUP, Tracking(target_size_m=0.1))
+        track_events(noise, SPAN_S, SETUP, Tracking(target_size_m=0.1, columns=24, cells=12))
 
 
 @pytest.fixture(scope="module")
@@ -168,9 +169,8 @@ def capture(tmp_path_factory):
 def test_the_command_follows_events_where_frames_are_left_out_or_absent(capture, tmp_path, capsys) -> None:
     folder, setup = capture
     pytest.importorskip("matplotlib")
-    main(
-        ["track", str(folder), "--setup", str(setup), "--no-frames", "--out", str(tmp_path / "t.png"), "--json"]
-    )
+    small = ["--setup", str(setup), "--columns", "24", "--cells", "12"]
+    main(["track", str(folder), *small, "--no-frames", "--out", str(tmp_path / "t.png"), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["frames"] == 0 and found["events"] > 1000 and "size_change" not in found
     assert found["position_error"] < 1e-3 and found["travel"] == pytest.approx(0.1, abs=0.002)
@@ -188,7 +188,7 @@ def test_the_command_follows_events_where_frames_are_left_out_or_absent(capture,
             main(["track", *words, "--setup", str(setup), "--targets", "2", "--out", str(tmp_path / "p.png")])
         assert "Tracking.targets is 2; several are found by frames alone" in capsys.readouterr().err
     assert not (tmp_path / "p.png").exists()
-    main(["track", str(folder.parent / "alone"), "--setup", str(setup), "--out", str(tmp_path / "a.png")])
+    main(["track", str(folder.parent / "alone"), *small, "--out", str(tmp_path / "a.png")])
     assert " events alone" in capsys.readouterr().out
 
 

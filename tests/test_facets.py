@@ -24,10 +24,19 @@ from evnlos.optics.facets import (
     seen_points,
     target_cells,
 )
+from evnlos.optics.radiometric import torchs_threads
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import FittedSetup, SensorSize
 from evnlos.setups.files import WALL, AboutWall, FittedWall, write_fitted
 from evnlos.types import Plane
+
+
+@pytest.fixture(autouse=True)
+def threads_of_torch():
+    """Kernels are called as they are here: what they leave of PyTorch's threads would slow all later tests."""
+    with torchs_threads():
+        yield
+
 
 POSE = Pose(
     camera_distance_m=0.55,

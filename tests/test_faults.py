@@ -25,7 +25,7 @@ from evnlos.data.simulations import estimate, find_faults
 from evnlos.files import directory_lock, is_empty
 from evnlos.machine import Step
 from evnlos.setups import RadiometricSetup
-from watching import Watch, alive, stopped
+from watching import StoppedError, Watch, alive, stopped
 
 COMMAND = [sys.executable, "-m", "evnlos"]
 TINY_RUN = ["train", "--epochs", "2", "--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
@@ -186,13 +186,15 @@ def test_a_dry_run_needs_no_module_that_windows_lacks(tiny, tmp_path, monkeypatc
 def test_a_folder_has_one_run_at_a_time(tiny, tmp_path) -> None:
     folder = tmp_path / "d"
     command = [*COMMAND, "simulate", "--out", str(folder)]
-    seconds = []
+    seconds, watch = [], Watch(1)
 
     def run_a_second_time(step: Step) -> None:
         if not seconds:
             seconds.append(subprocess.run(command, capture_output=True, text=True, timeout=120))
+        watch(step)
 
-    simulate(tiny, folder, progress=run_a_second_time)
+    with pytest.raises(StoppedError):
+        simulate(tiny, folder, progress=run_a_second_time)
     assert seconds[0].returncode == 2
     assert "another process is at work" in seconds[0].stderr
     with directory_lock(folder):

@@ -8,6 +8,7 @@ import pytest
 
 from evnlos.errors import ConfigError
 from evnlos.lab import LitCells, Lobe, Optics, Reflection, cast, fill_throughput, texture
+from evnlos.optics.radiometric import torchs_threads
 
 SHAPES = ("ggx", "beckmann", "streak", "ring")
 OPTICS = Optics(
@@ -183,7 +184,8 @@ def test_the_matrix_is_the_sum_over_rays_and_cells():
     discs = np.array([[-0.08, 0.0, 0.15, 0.02], [0.0, 0.02, 0.1, 0.01]])
     out = np.full((24, 9), np.nan, np.float32)
     table = mixture().table()
-    fill_throughput(out, rays, LitCells(*cells.T.copy(), emission, 0.3), table, discs)
+    with torchs_threads():
+        fill_throughput(out, rays, LitCells(*cells.T.copy(), emission, 0.3), table, discs)
     slow = slow_throughput(rays, cells, emission, 0.3, mixture(), discs)
     np.testing.assert_allclose(out, slow, rtol=2e-6)
     without = slow_throughput(rays, cells, emission, 0.3, mixture(), discs[:0])

@@ -51,6 +51,15 @@ def test_the_wall_at_a_key_frame_is_what_the_operator_says(changes):
     torch.testing.assert_close(seen, expected, rtol=1e-4, atol=1e-5)
 
 
+def test_a_process_that_begins_with_a_room_keeps_the_threads_of_pytorch():
+    """It had a thread for each core, which waited for each other at every operation after the room."""
+    code = (
+        "import torch\nfrom evnlos.setups import RoomSetup\nfrom evnlos.types import Plane\n"
+        "RoomSetup().throughput((4, 6), Plane(2, 3, 0.01))\nprint(torch.get_num_threads())"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "1\n"  # as `conftest.py` asks
+
+
 def test_gain_is_the_brightest_pixel_while_a_square_shines():
     square = Scene(
         Target("square", np.ones((4, 4), np.float32)), LineMotion(start_m=(0.0, 0.0), speed_m_s=0.0), 1.0

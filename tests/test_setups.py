@@ -130,6 +130,7 @@ def test_the_operator_and_its_adjoint_agree(setup: Setup) -> None:
     assert operator.source == PLANE and operator.shape == SHAPE
     assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.adjoint(y)).sum()), rel=1e-9)
     torch.testing.assert_close(operator(2 * x[0] - x[1]), 2 * operator(x[0]) - operator(x[1]))
+    torch.testing.assert_close(operator.dense() @ x[0].flatten(), operator(x[0]).flatten())
 
 
 def test_a_smaller_image_has_the_mean_light(setup: Setup) -> None:

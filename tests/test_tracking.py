@@ -298,7 +298,7 @@ def test_the_calibrated_operator_finds_the_path() -> None:
 @pytest.mark.parametrize("depth", [False, True])
 def test_ambient_light_that_is_not_quite_known_moves_no_place(depth) -> None:
     own = SETUP.transport(SHAPE)
-    positions = np.stack([np.linspace(-0.06, 0.06, 7), 0.01 * np.sin(np.arange(7.0))], axis=1)
+    positions = np.stack([np.linspace(-0.05, 0.05, 7), 0.01 * np.sin(np.arange(7.0))], axis=1)
     light = SETUP.gain * own(torch.from_numpy(letter().rasterise(own.source, positions))).double()
     light += 2e-3 * torch.from_numpy(np.random.default_rng(6).standard_normal(light.shape))
     rest = torch.from_numpy(0.05 * ambient())  # a twentieth of it: what a fit of the ambient light may leave

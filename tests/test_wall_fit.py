@@ -27,6 +27,7 @@ from evnlos.data.capture_info import CameraInfo, MotionInfo, TargetInfo
 from evnlos.errors import ConfigError, DataError
 from evnlos.lab import LitCells, Lobe, Optics, Reflection, cast, fill_throughput
 from evnlos.optics.facets import Pose, SlopeTable
+from evnlos.optics.radiometric import torchs_threads
 from evnlos.report.sections import setup_section
 from evnlos.scene import FontGlyphs
 from evnlos.setups import RadiometricSetup
@@ -51,7 +52,8 @@ def operator(bent: float = 0.0, corner: float = 0.0) -> np.ndarray:
     y, x = np.meshgrid(WIDE.y_m, WIDE.x_m, indexing="ij")
     cells = LitCells(x.ravel() - 0.165, y.ravel() + 0.004, np.full(x.size, WIDE.pitch_m**2), 0.3)
     out = np.zeros((SHAPE[0] * SHAPE[1], x.size), np.float32)
-    fill_throughput(out, rays, cells, reflection.table(), np.zeros((0, 4)))
+    with torchs_threads():
+        fill_throughput(out, rays, cells, reflection.table(), np.zeros((0, 4)))
     return out
 
 

@@ -92,6 +92,7 @@ def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
     return TargetPrior(mean, root, test, tuple(testing.objects()), stroke)
 
 
+@lru_cache(maxsize=1)  # planes of other cells ask for the same
 def _drawn(writers: int) -> tuple[Target, ...]:
     """Return training targets in the hands of some writers."""
     training = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=writers)

@@ -144,15 +144,17 @@ def tpsf_kernel(
         raise ConfigError(
             f"the tPSF spans {2 * radius + 1} samples, above {_MAX_KERNEL}; raise pitch_m or lower length_m"
         )
-    offset = torch.arange(-radius, radius + 1, dtype=torch.float64) * step
-    rho = (offset[:, None] ** 2 + offset**2).sqrt()
+    offset = torch.arange(radius + 1, dtype=torch.float64) * step
+    rho = (offset[:, None] ** 2 + offset**2).sqrt()  # of a quarter, which the others mirror
     # Few radii are distinct on a grid; the sum over k is the costly part.
     distinct, where = torch.unique(rho, return_inverse=True)
     weight = (distinct <= kernel_radius * (1 + 1e-12)).to(torch.float64)
     if window > 0:
         into = ((distinct / kernel_radius - (1 - window)) / window).clamp(0, 1)
         weight = weight * (0.5 + 0.5 * torch.cos(math.pi * into))
-    kernel = (tpsf_profile(distinct, t, mean_free_path, terms) * weight)[where]
+    quarter = (tpsf_profile(distinct, t, mean_free_path, terms) * weight)[where]
+    half = torch.cat([quarter[1:].flip(0), quarter])
+    kernel = torch.cat([half[:, 1:].flip(1), half], dim=1)
     total = kernel.sum()
     if not abs(total.item()) > 0:
         raise ConfigError(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import ClassVar, Literal
 
 import torch
 
 from evnlos.cameras import EventPixel
 from evnlos.errors import ConfigError
+from evnlos.machine import note
 from evnlos.optics import (
     Diffraction,
     DiffuseReflection,
@@ -208,13 +210,8 @@ class PaperSetup(Setup):
         }
 
     def _kernel(self, pitch_m: float) -> torch.Tensor:
-        return tpsf_kernel(
-            pitch_m,
-            self.tpsf_length_m,
-            t=self.tpsf_t,
-            mean_free_path=self.mean_free_path,
-            kernel_radius=self.kernel_radius,
-            window=self.window,
+        return _tpsf(
+            pitch_m, self.tpsf_length_m, self.tpsf_t, self.mean_free_path, self.kernel_radius, self.window
         )
 
     @property
@@ -227,19 +224,43 @@ class PaperSetup(Setup):
         )
 
 
+@lru_cache(maxsize=2)  # a fit asks for each capture's, and they share it
+def _tpsf(
+    pitch_m: float, length_m: float, t: float, mean_free_path: float, radius: float, window: float
+) -> torch.Tensor:
+    return tpsf_kernel(
+        pitch_m, length_m, t=t, mean_free_path=mean_free_path, kernel_radius=radius, window=window
+    )
+
+
 class _LinearPart(LinearTransport):
     """Diffuse reflection and view of cells that are drawn on finer samples."""
 
     def __init__(
         self, plane: Plane, fine: int, reflection: DiffuseReflection, view: ViewOperator, gain: float
     ) -> None:
-        self.source = plane
+        self.source = self._plane = plane
         self._fine, self._gain = fine, gain
         self._reflection, self._view = reflection, view
 
     @property
     def shape(self) -> tuple[int, int]:
         return self._view.shape
+
+    def dense(self, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+        """Return the matrix, [H W, h w]: what a cell reflects is the same everywhere, only shifted."""
+        (height, width), side = self._plane.shape, self._fine
+        one = Plane(side, side, self._plane.pitch_m / side)
+        spot = DiffuseReflection(one, self._reflection.kernel)(torch.ones(one.shape, dtype=dtype))
+        rows = []
+        for row in range(height):
+            note(f"light path, {row * width} of {height * width} cells")
+            wall = torch.zeros(width, *self._reflection.shape, dtype=dtype)
+            for column, lit in enumerate(wall):
+                down, across = row * side, column * side
+                lit[down : down + spot.shape[0], across : across + spot.shape[1]] = spot
+            rows.append(self._gain * self._view(wall).flatten(1).mT)
+        return torch.cat(rows, dim=1)
 
     def _forward(self, scene: torch.Tensor) -> torch.Tensor:
         samples = scene.repeat_interleave(self._fine, -2).repeat_interleave(self._fine, -1)

@@ -30,7 +30,7 @@ from evnlos.lab import (
     waves,
 )
 from evnlos.optics import MatrixTransport
-from evnlos.optics.radiometric import noted_rows
+from evnlos.optics.radiometric import noted_rows, torchs_threads
 from evnlos.scene import Scene
 from evnlos.setups.base import Setup, stated_distance_m
 from evnlos.types import Plane
@@ -278,8 +278,9 @@ class RoomSetup(Setup):
             discs = np.array([[tx + ox, ty + oy, tz, self.lamp.body_m]])
         out = np.empty((shape[0] * shape[1], len(x)), np.float32)
         cells, table = LitCells(x + ox, y + oy, emission, self.distance_m), self.reflection.table()
-        for here in noted_rows(len(out)):
-            fill_throughput(out[here], Rays(*(values[here] for values in rays)), cells, table, discs)
+        with torchs_threads():
+            for here in noted_rows(len(out)):
+                fill_throughput(out[here], Rays(*(values[here] for values in rays)), cells, table, discs)
         return out
 
     def _light_path(self) -> RoomSetup:

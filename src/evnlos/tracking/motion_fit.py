@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import embedding_bag
 
 from evnlos.inverse import BackgroundModel
 from evnlos.inverse.operators import Gradient, normal_matrix
@@ -377,8 +378,7 @@ class Lights:
         own = away.basis.double()
         smooth = own[:, :0] if degree is None else _ambient(shape, degree)
         self.basis = torch.linalg.qr(torch.cat([smooth, own], dim=1))[0]
-        self._away, self.ambient = copy(away), smooth.shape[1]
-        self._known: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}
+        self._away, self.ambient, self._known = copy(away), smooth.shape[1], dict[float, torch.Tensor]()
         turn = self.basis.mT @ own
         # All at once take gigabytes.
         planes = ((turn @ one.double()).unflatten(-1, strip.shape) for one in away.nodes)
@@ -387,18 +387,21 @@ class Lights:
             parts = self._away.nodes.double().transpose(0, 1).flatten(1)
             ways = torch.linalg.eigh(parts @ parts.mT)[1][:, -rank:]
             self.basis, self._away.nodes = self.basis @ ways, ways.mT.float() @ self._away.nodes
+        self._away.nodes = self._away.nodes.mT.contiguous()  # poses take rows of them
 
     def seen(self, light: torch.Tensor) -> torch.Tensor:
         """Return frames [N, H, W] as their parts [N, P], float64."""
         return light.double().flatten(1) @ self.basis
 
-    def at(self, log_distance: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return splines over the strip, [P, cells], and their derivative by ln(distance)."""
-        if log_distance not in self._known:
-            self._known.clear()  # poses in a plane ask for the same one again
-            away, distance_m = self._away, self._own_m * math.exp(log_distance)
-            self._known[log_distance] = away.coefficients(distance_m).double(), away.slope(distance_m).double()
+    def at(self, log_distance: float) -> torch.Tensor:
+        """Return splines over the strip, [cells, P]."""
+        if log_distance not in self._known:  # poses in a plane ask for the same one again
+            self._known = {log_distance: self._away.coefficients(self._own_m * math.exp(log_distance)).double()}
         return self._known[log_distance]
+
+    def slope(self, log_distance: float) -> torch.Tensor:
+        """Return the splines' derivative by ln(distance), [cells, P]."""
+        return self._away.slope(self._own_m * math.exp(log_distance)).double()
 
     def taps(self, plane: Plane, pose: Array) -> tuple[torch.Tensor, torch.Tensor, dict[int, torch.Tensor]]:
         """Return which splines the cells of a target in a pose take, and how much of each.
@@ -445,18 +448,18 @@ class Fit:
     def __init__(
         self, target_plane: Plane, lights: Lights, poses: Array, kinds: list[int], scale: Array
     ) -> None:
-        self.target_plane, self._scale = target_plane, scale
-        self._found = (*poses.shape[1:-1], *target_plane.shape)
-        targets = math.prod(poses.shape[1:-1])
+        self.target_plane, self._lights, self._scale = target_plane, lights, scale
+        targets, self._found = math.prod(poses.shape[1:-1]), (*poses.shape[1:-1], *target_plane.shape)
         self._each, self._kinds = kinds, kinds * targets
         every = poses.reshape(len(poses), targets, -1)
         self._sights = [[(float(one[2]), *lights.taps(target_plane, one)) for one in each] for each in every]
         # The lights of a distance are made anew where they are needed: one for each frame takes gigabytes.
-        self._lights, maps = lights, list[torch.Tensor]()
-        for each in self._sights:
-            own = [(lights.at(away)[0][:, at] * weights).sum(dim=1) for away, at, weights, _ in each]
-            maps.append(torch.cat(own, dim=1))
-        self.maps = torch.stack(maps)  # [N, P, K n n]
+        bags = [
+            embedding_bag(at.mT, lights.at(away), per_sample_weights=weights.mT, mode="sum")
+            for each in self._sights
+            for away, at, weights, _ in each
+        ]
+        self.maps = torch.cat(bags).unflatten(0, (len(poses), -1)).mT  # [N, P, K n n]
         self._total = self.maps.sum(dim=0)
         # What an unknown offset of each pixel takes off the mean of each part; ambient light takes all of it.
         share = torch.ones(self.maps.shape[1], dtype=torch.float64) / len(poses)
@@ -519,16 +522,14 @@ class Fit:
         """Return the frames' derivatives, [N, K, P], a metre, by the poses of all targets, at these [K n n]."""
         rows = []
         for sights in self._sights:
-            each = []
             for (away, at, weights, ways), one in zip(sights, image.reshape(len(sights), -1), strict=True):
-                own, by_distance = self._lights.at(away)
                 for kind in self._each:
-                    cells = torch.zeros(own.shape[1], dtype=image.dtype)
+                    lights = self._lights.slope(away) if kind == 2 else self._lights.at(away)
                     used = weights if kind == 2 else ways[kind]
+                    cells = torch.zeros(len(lights), dtype=image.dtype)
                     cells.index_add_(0, at.flatten(), (used * one).flatten())
-                    each.append((by_distance if kind == 2 else own) @ cells / self._scale[kind])
-            rows.append(torch.stack(each))
-        return torch.stack(rows)
+                    rows.append(cells @ lights / self._scale[kind])
+        return torch.stack(rows).unflatten(0, (len(self._sights), -1))
 
     def _moving(self, frames: torch.Tensor) -> torch.Tensor:
         """Return frames [N, P] without what stands still in them, as far as it is not known."""
