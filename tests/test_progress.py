@@ -172,8 +172,8 @@ def test_identify_says_what_it_works_on(monkeypatch) -> None:
     told = list[str]()
     for room in ("analysis.identify", "analysis.linearized", "inverse.prior"):
         monkeypatch.setattr(importlib.import_module(f"evnlos.{room}"), "note", told.append)
-    # Cells of no other test, whose targets would be known already.
-    identify(load_setup("matte-near"), AnalysisSettings(cells=9, height=12, width=20, writers=1))
+    # Cells and hands of no other test, whose targets would be known already.
+    identify(load_setup("matte-near"), AnalysisSettings(cells=9, height=12, width=20, writers=3))
     parts = ("light path", "handwritten target 2 of", "singular values", "modes at a noise", "bars of")
     assert not [part for part in parts if not any(one.startswith(part) for one in told)]
 
