@@ -155,8 +155,8 @@ def readme() -> None:
     """The Python of the README and of the event pixel prints what it says, or names the extra that it needs."""
     from evnlos.errors import MissingDependencyError
 
-    pages = "".join((ROOT / name).read_text() for name in ("README.md", "docs/event_pixel.md"))
-    blocks = re.findall(r"```(\w*)\n(.*?)```", pages, flags=re.DOTALL)
+    pixel, _, _ = (ROOT / "docs" / "event_pixel.md").read_text().partition("## Parameters")
+    blocks = re.findall(r"```(\w*)\n(.*?)```", (ROOT / "README.md").read_text() + pixel, flags=re.DOTALL)
     names: dict[str, object] = {}
     whole = 0
     for (kind, code), (_, printed) in zip(blocks, [*blocks[1:], ("", "")], strict=True):
