@@ -126,8 +126,9 @@ def load_pixel_maps(word: str | Path) -> PixelMaps | None:
         check_threshold_maps((numbers[0], numbers[1]), hot.shape)
         if hot.ndim != 2 or not all(one.shape == hot.shape and (one >= 0).all() for one in numbers):
             raise ValueError("its maps are not of one size, or negative")
-    except (ConfigError, *NUMPY_ERRORS) as error:
-        raise DataError(f"{path} holds no thresholds of a sensor: {' '.join(str(error).split())}") from None
+    except (ConfigError, *NUMPY_ERRORS):
+        cure = "give the one that `evnlos pixel fit` wrote, or take it out of the folder"
+        raise DataError(f"{path} holds no thresholds of a sensor, or is damaged; {cure}") from None
     on, off, error_on, error_off = numbers
     return PixelMaps(on, off, error_on, error_off, hot)
 
