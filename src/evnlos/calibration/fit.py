@@ -26,7 +26,6 @@ from evnlos.calibration.frame_model import (
     FrameNoise,
     coarse_shape,
     fit_frame_noise,
-    own_factors,
     steadied,
 )
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
@@ -390,21 +389,19 @@ def _fit_steadied(
         return model.left(model.predict(setup))
 
     optics = wall(fit, held)
-    found = own_factors(fit, held, optics.setup)
-    if found is None:
+    steadier = steadied(fit, held, optics.setup)
+    if steadier is None:
         return optics, fit, held
     note("what differs from capture to capture")
-    steady, again, there = (fit, held), optics, optics.setup
-    usual = np.concatenate(found)[:, [0, 1]]
-    if np.ptp(usual, axis=0).any():  # light that differs spoils the fit of all
-        there = wall(replace(fit, drifts=True), replace(held, drifts=True)).setup
+    if any(own[:2] != (1.0, 1.0) for one in steadier for own in one.own):  # light: it spoils the fit of all
+        steadier = steadied(fit, held, wall(replace(fit, drifts=True), replace(held, drifts=True)).setup)
+    steady, again = (fit, held), optics
     for _ in range(_MOST_STEADYING):
-        steadier = steadied(*steady, there)
         if steadier is None:
             break
         steady, again = steadier, wall(*steadier)
-        there = again.setup
-    is_better = left(there, steady[1]) < _STEADIER * left(optics.setup, held)
+        steadier = steadied(*steady, again.setup)
+    is_better = left(again.setup, steady[1]) < _STEADIER * left(optics.setup, held)
     return (again, *steady) if is_better else (optics, fit, held)
 
 

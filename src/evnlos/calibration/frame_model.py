@@ -209,7 +209,7 @@ def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSe
     Returns:
         The same captures; None where they do not differ by what frames show.
     """
-    factors = own_factors(fit, held, setup)
+    factors = _own_factors(fit, held, setup)
     if factors is None:
         return None
     around, found = setup.ambient_light(fit.shape).numpy(), list[CaptureSet]()
@@ -235,7 +235,7 @@ def steadied(fit: CaptureSet, held: CaptureSet, setup: Setup) -> tuple[CaptureSe
     return found[0], found[1]
 
 
-def own_factors(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[NDArray[np.float64]] | None:
+def _own_factors(fit: CaptureSet, held: CaptureSet, setup: Setup) -> list[NDArray[np.float64]] | None:
     """Return what each has of its own [captures, 6], in the order of `Own`; None where frames show nothing.
 
     What all have alike is the setup's: a median, the middle of the places. Ambient light stays beside the

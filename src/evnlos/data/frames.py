@@ -272,10 +272,12 @@ def clipped_at(frames: NDArray, peak: int) -> int:
     the largest, and far more frequent than those below it.
 
     Args:
-        frames: Frames, unsigned integers of any shape, digital numbers.
+        frames: Frames, unsigned integers [N, H, W], digital numbers.
         peak: The file's white, the largest digital number.
     """
-    counts = np.bincount(np.asarray(frames).ravel(), minlength=peak + 1)
+    counts = np.zeros(peak + 1, np.int64)
+    for frame in frames:  # of all at once numpy makes numbers eight times as large
+        counts += np.bincount(frame.ravel(), minlength=peak + 1)
     *_, last = there = np.flatnonzero(counts)
     usual = int(counts[there[-5:-1]].max(initial=0))
     is_clipped = len(there) > 4 and counts[last] > max(_PLATEAU * usual, _LEAST_CLIPPED * frames.size)
